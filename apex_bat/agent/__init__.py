@@ -1,0 +1,1 @@
+"""The policy: dueling network, losses, exploration."""

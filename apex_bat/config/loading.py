@@ -1,0 +1,135 @@
+"""Reading settings from TOML files and the command line, and writing what was resolved."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import tomli_w
+
+from apex_bat.config.settings import Config
+
+
+class ConfigError(ValueError):
+    """A setting that is unknown, of the wrong type, out of range or in contradiction with another."""
+
+
+def load(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
+    """Returns the settings of a TOML file, changed by overrides such as `replay.capacity=50000`.
+
+    Args:
+        path: the file; None: the defaults.
+        overrides: `section.key=value` with the value in TOML's notation; a bare word is taken as a string, and `none`
+            means None where that is allowed.
+
+    Raises:
+        ConfigError: names the setting, what was given and what is allowed.
+    """
+    table = _read(path) if path is not None else {}
+    for override in overrides:
+        _apply(table, override)
+    origin = f"{path}: " if path is not None else ""
+    try:
+        return msgspec.convert(table, Config)
+    except msgspec.ValidationError as error:
+        raise ConfigError(origin + _explain(str(error))) from None
+
+
+def save(config: Config, path: Path) -> None:
+    """Writes all settings as TOML. TOML has no null: the word "none" stands for it, where None is not the default."""
+    path.write_text(dumps(config), encoding="utf-8")
+
+
+def dumps(config: Config) -> str:
+    """Returns all settings as TOML text, which `load` reads back to an equal object."""
+    return tomli_w.dumps(_without_none(msgspec.to_builtins(config), Config()))
+
+
+def differences(left: Config, right: Config) -> list[str]:
+    """Returns a line for each setting in which two configurations differ: `key: left | right`."""
+    a, b = _flatten(msgspec.to_builtins(left)), _flatten(msgspec.to_builtins(right))
+    return [f"{key}: {a[key]} | {b[key]}" for key in a if a[key] != b[key]]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return _with_none(tomllib.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; configurations that ship are in configs/") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+
+
+def _with_none(table: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: _with_none(value) if isinstance(value, dict) else None if value == "none" else value
+        for key, value in table.items()
+    }
+
+
+def _apply(table: dict[str, Any], override: str) -> None:
+    key, separator, text = override.partition("=")
+    parts = key.strip().split(".")
+    if not separator or not all(parts):
+        raise ConfigError(f"--set {override}: expected section.key=value, for example --set replay.capacity=50000")
+    for part in parts[:-1]:
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict):
+            raise ConfigError(f"--set {override}: {part} is a value, not a section")
+    table[parts[-1]] = _value(text.strip())
+
+
+def _value(text: str) -> Any:
+    if text.strip("\"'") == "none":
+        return None
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _explain(message: str) -> str:
+    """Turns msgspec's message into one that names the setting and, for an unknown one, the nearest that exists."""
+    text, _, where = message.partition(" - at `$")
+    section = where.strip("`.")
+    unknown = re.search(r"unknown field `(.+)`", text)
+    if unknown is None:
+        return f"{section}: {text[0].lower()}{text[1:]}" if section else text
+    name = f"{section}.{unknown[1]}" if section else unknown[1]
+    known = list(_flatten(msgspec.to_builtins(Config()), sections=True))
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5) or [
+        key for key in known if key.rpartition(".")[2] == unknown[1]
+    ]
+    hint = f"; did you mean {near[0]}?" if near else "; `apex-bat train --help` says where the settings are listed"
+    return f"{name}: no such setting{hint}"
+
+
+def _flatten(table: dict[str, Any], prefix: str = "", sections: bool = False) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        if isinstance(value, dict):
+            if sections:
+                flat[prefix + key] = value
+            flat |= _flatten(value, f"{prefix}{key}.", sections)
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def _without_none(table: dict[str, Any], default: msgspec.Struct) -> dict[str, Any]:
+    kept: dict[str, Any] = {}
+    for key, value in table.items():
+        if isinstance(value, dict):
+            kept[key] = _without_none(value, getattr(default, key))
+        elif value is not None:
+            kept[key] = value
+        elif getattr(default, key) is not None:
+            kept[key] = "none"
+    return kept

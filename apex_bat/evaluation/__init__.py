@@ -1,0 +1,1 @@
+"""Judging policies: flights, baselines, statistics, figures."""

@@ -1,0 +1,1 @@
+"""The central prioritized replay: buffer, sum tree, rate limiter, server and clients."""

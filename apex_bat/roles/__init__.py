@@ -1,0 +1,1 @@
+"""What each process does: actor, replay, learner, evaluator."""

@@ -1,0 +1,1 @@
+"""The wire: typed messages over ZeroMQ, CURVE keys, weights."""

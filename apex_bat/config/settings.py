@@ -24,7 +24,7 @@ class Section(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A table of the configuration file; unknown keys are refused."""
 
 
-class Body(Section):
+class Body(Section, frozen=True):
     """The robot and how it moves (thesis ch. 3)."""
 
     diameter_m: Positive = 0.35
@@ -43,7 +43,7 @@ class Body(Section):
     """Standard deviation of the relative error of the speed at each step. 0 in the thesis."""
 
 
-class Rays(Section):
+class Rays(Section, frozen=True):
     """The range sensors. The 3D one feeds the ear, the 2D one the reward (thesis section 3.1)."""
 
     caster: Literal["embree", "pybullet"] = "embree"
@@ -62,7 +62,7 @@ class Rays(Section):
     """Farther than this is a miss."""
 
 
-class Sonar(Section):
+class Sonar(Section, frozen=True):
     """The call, the air, the reflectors and the ears (thesis section 3.1, eq. 3.1.1)."""
 
     rendering: Literal["thesis", "exact"] = "thesis"
@@ -115,7 +115,7 @@ class Sonar(Section):
             raise ValueError('directivity_table and directivity = "table" belong together')
 
 
-class Sensing(Section):
+class Sensing(Section, frozen=True):
     """How echoes become the state that the policy sees (thesis section 3.2)."""
 
     memory_steps: Annotated[int, Meta(ge=1, le=8)] = 3
@@ -128,7 +128,7 @@ class Sensing(Section):
     """Whether the last three actions are part of the state (thesis eq. 3.2.1)."""
 
 
-class Episode(Section):
+class Episode(Section, frozen=True):
     """Reward, counters and ends of an episode (thesis eq. 3.2.2)."""
 
     near_m: Positive = 0.4
@@ -149,7 +149,7 @@ class Episode(Section):
     """Least clearance of a start pose; a way out must exist too."""
 
 
-class Network(Section):
+class Network(Section, frozen=True):
     """The dueling network (thesis fig. 3.8: (1, 3) filters, so that each echo row is filtered by itself)."""
 
     channels: tuple[Count, ...] = (16, 32)
@@ -172,7 +172,7 @@ class Network(Section):
             )
 
 
-class Learner(Section):
+class Learner(Section, frozen=True):
     """Updates of the network (D3QN: van Hasselt 2016, Wang 2016, Schaul 2016, Horgan 2018)."""
 
     batch_size: Count = 64
@@ -207,7 +207,7 @@ class Learner(Section):
     """Batches asked for ahead. Ape-X 16; each is that much older when it is used."""
 
 
-class Exploration(Section):
+class Exploration(Section, frozen=True):
     """The epsilon-greedy ladder: actor i of N keeps 0.4^(1 + 7 i / (N - 1)) (Ape-X)."""
 
     kind: Literal["ladder", "anneal"] = "ladder"
@@ -226,7 +226,7 @@ class Exploration(Section):
     """Steps of all bats together over which `anneal` runs, linearly."""
 
 
-class Replay(Section):
+class Replay(Section, frozen=True):
     """The central prioritized replay (Schaul 2016, Horgan 2018) and its rate limiter (Reverb's law)."""
 
     capacity: Annotated[int, Meta(ge=16)] = 200_000
@@ -264,7 +264,7 @@ class Replay(Section):
             raise ValueError(f"min_size {self.min_size} exceeds capacity {self.capacity}: sampling would never start")
 
 
-class Actor(Section):
+class Actor(Section, frozen=True):
     """How actors gather and send experience."""
 
     chunk_transitions: Annotated[int, Meta(ge=1, le=1000)] = 50
@@ -275,7 +275,7 @@ class Actor(Section):
     """Steps of a bat between looks for newer weights (Ape-X: 400 frames, 5 to 10 s of flight)."""
 
 
-class Transport(Section):
+class Transport(Section, frozen=True):
     """Where the roles listen (see apex_bat.transport)."""
 
     host: str = "ipc"
@@ -288,7 +288,7 @@ class Transport(Section):
     """A larger message is refused."""
 
 
-class Train(Section):
+class Train(Section, frozen=True):
     """When training ends."""
 
     max_minutes: Positive | None = 12.0
@@ -305,7 +305,7 @@ class Train(Section):
             raise ValueError("set at least one of max_minutes, max_env_steps and max_updates, or training never ends")
 
 
-class Checkpoint(Section):
+class Checkpoint(Section, frozen=True):
     """Checkpoints of the learner."""
 
     period_s: Positive = 30.0
@@ -314,7 +314,7 @@ class Checkpoint(Section):
     """Newest checkpoints kept, beside the best one."""
 
 
-class Evaluation(Section):
+class Evaluation(Section, frozen=True):
     """Greedy flights that judge a policy."""
 
     flights: Count = 15
@@ -329,7 +329,7 @@ class Evaluation(Section):
     """Seconds between the starts of two evaluations during training."""
 
 
-class Recording(Section):
+class Recording(Section, frozen=True):
     """What is written to rerun recordings."""
 
     evaluation_flights: CountOrZero = 3
@@ -342,7 +342,7 @@ class Recording(Section):
     """The oldest recordings of episodes go when they exceed this together."""
 
 
-class Launch(Section):
+class Launch(Section, frozen=True):
     """How roles are watched and restarted."""
 
     backoff_s: Positive = 0.2
@@ -355,7 +355,7 @@ class Launch(Section):
     """How long a role may take to end after it was asked to."""
 
 
-class Config(Section):
+class Config(Section, frozen=True):
     """All settings of a run."""
 
     seed: CountOrZero = 0

@@ -1,0 +1,119 @@
+"""The learning agent: dueling double deep Q-network with importance-weighted n-step updates.
+
+Ingredients: dueling streams (Wang et al. 2016), double Q-learning (van Hasselt et al. 2016), prioritized replay with
+importance weights (Schaul et al. 2016), n-step targets, (centred) RMSprop and a clipped gradient (Horgan et al. 2018).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from apex_bat.agent.losses import double_q_target, td_errors, weighted_loss
+from apex_bat.agent.network import DuelingNetwork, load_parameters, parameters_of, to_tensors
+from apex_bat.config import Config, settings
+from apex_bat.experience import Batch
+
+
+class Update(NamedTuple):
+    """What one update did."""
+
+    errors: NDArray[np.float32]
+    """(batch,): TD errors before the update; their sizes are the new priorities."""
+    loss: float
+    """Mean weighted loss."""
+    gradient_norm: float
+    """Global norm of the gradient before clipping."""
+    q_mean: float
+    """Mean of Q(s, a) over the batch."""
+
+
+class D3QN:
+    """Online and target network with their optimiser, and the count of updates."""
+
+    def __init__(self, config: Config, device: torch.device) -> None:
+        """Makes both networks equal, drawn from torch's global generator: seed it before."""
+        self._settings = config.learner
+        self.device = device
+        self.online = DuelingNetwork(config.network, config.state_steps).to(device)
+        self.target = DuelingNetwork(config.network, config.state_steps).to(device)
+        self.target.load_state_dict(self.online.state_dict())
+        self.target.requires_grad_(False)
+        self.optimiser = _optimiser(self.online, config.learner)
+        self.num_updates = 0
+
+    def update(self, batch: Batch) -> Update:
+        """Takes one step of gradient descent on a batch and copies the target network when its time has come."""
+        states = to_tensors(batch.states, self.device)
+        next_states = to_tensors(batch.next_states, self.device)
+        rewards, discounts, weights = (
+            torch.from_numpy(array).to(self.device) for array in (batch.rewards, batch.discounts, batch.weights)
+        )
+        with torch.no_grad():
+            targets = double_q_target(rewards, discounts, self.online(*next_states).q, self.target(*next_states).q)
+        q = self.online(*states).q
+        errors = td_errors(q, torch.from_numpy(batch.actions).to(self.device), targets)
+        loss = weighted_loss(errors, weights, self._settings.loss)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        limit = self._settings.gradient_clip if self._settings.gradient_clip > 0.0 else float("inf")
+        norm = torch.nn.utils.clip_grad_norm_(self.online.parameters(), limit)
+        self.optimiser.step()
+        self.num_updates += 1
+        self._follow()
+        return Update(errors.detach().cpu().numpy(), float(loss.detach()), float(norm), float(q.detach().mean()))
+
+    def weights(self) -> dict[str, NDArray[np.float32]]:
+        """Returns copies of the online network's parameters by name."""
+        return parameters_of(self.online)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Returns everything that learning continues from: both networks and the optimiser's state, by name."""
+        arrays: dict[str, NDArray[Any]] = {f"online/{k}": v for k, v in parameters_of(self.online).items()}
+        arrays |= {f"target/{k}": v for k, v in parameters_of(self.target).items()}
+        for number, state in self.optimiser.state_dict()["state"].items():
+            for key, value in state.items():
+                arrays[f"optimiser/{number}/{key}"] = torch.as_tensor(value).cpu().numpy().copy()
+        return arrays
+
+    def restore(self, arrays: dict[str, NDArray[Any]], num_updates: int) -> None:
+        """Continues from what `arrays` returned.
+
+        Raises:
+            ValueError: the arrays are of another network or another optimiser.
+        """
+        for name, network in (("online/", self.online), ("target/", self.target)):
+            load_parameters(network, {k.removeprefix(name): v for k, v in arrays.items() if k.startswith(name)})
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for name, array in arrays.items():
+            if name.startswith("optimiser/"):
+                _, number, key = name.split("/")
+                state.setdefault(int(number), {})[key] = torch.from_numpy(np.array(array))
+        groups = self.optimiser.state_dict()["param_groups"]
+        if num_updates and set(state) != {number for group in groups for number in group["params"]}:
+            raise ValueError("the checkpoint's optimiser state does not fit this network")
+        self.optimiser.load_state_dict({"state": state, "param_groups": groups})
+        self.num_updates = num_updates
+
+    def _follow(self) -> None:
+        period, tau = self._settings.target_period, self._settings.target_tau
+        if period == 0:
+            with torch.no_grad():
+                for slow, fast in zip(self.target.parameters(), self.online.parameters(), strict=True):
+                    slow.lerp_(fast, tau)
+        elif self.num_updates % period == 0:
+            self.target.load_state_dict(self.online.state_dict())
+
+
+def _optimiser(network: DuelingNetwork, learner: settings.Learner) -> torch.optim.Optimizer:
+    if learner.optimiser == "adam":
+        return torch.optim.Adam(
+            network.parameters(), learner.learning_rate, eps=learner.epsilon, weight_decay=learner.weight_decay
+        )
+    return torch.optim.RMSprop(
+        network.parameters(), learner.learning_rate, alpha=learner.rmsprop_decay, eps=learner.epsilon,
+        weight_decay=learner.weight_decay, centered=learner.rmsprop_centred,
+    )  # fmt: skip

@@ -1,0 +1,84 @@
+"""The command line, `apex-bat`: every command in one list. Heavy imports happen inside the commands.
+
+Exit codes: 0 success, 1 a failed run, 2 wrong usage, 130 interrupted; errors are one line on standard error.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import typer
+
+from apex_bat import __version__
+from apex_bat.cli import judging, roles, training
+from apex_bat.config import ConfigError
+
+app = typer.Typer(
+    name="apex-bat",
+    help="Train an artificial bat that flies by its echoes, on many processes (Ape-X), and look at how it flies.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+app.command("train")(training.train)
+app.command("evaluate")(judging.evaluate)
+app.command("inspect")(judging.inspect)
+app.command("status")(judging.status)
+app.command("arena")(judging.arena)
+app.command("bench")(judging.bench)
+app.command("keys")(roles.keys)
+for _kind in roles.COMMANDS:
+    app.command(_kind)(roles.COMMANDS[_kind])
+
+
+@app.callback(invoke_without_command=True)
+def _version(version: bool = typer.Option(False, "--version", help="Print the version and exit.")) -> None:
+    if version:
+        print(f"apex-bat {__version__}")
+        raise typer.Exit
+
+
+def main() -> int:
+    """Runs a command and returns its exit code; known errors are printed as one line."""
+    try:
+        result = app(standalone_mode=False)
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        return _report(error)
+    return result if isinstance(result, int) else 0
+
+
+def _report(error: Exception) -> int:
+    """Prints a known error as one line and returns the exit code; an unknown one goes on as a traceback."""
+    import click
+
+    from apex_bat.storage import StorageError
+
+    if isinstance(error, click.exceptions.Abort):
+        return 130
+    if isinstance(error, click.ClickException):
+        error.show()
+        return error.exit_code
+    if isinstance(error, ConfigError):
+        return _line(error, 2)
+    known = {"ArenaError": 2, "TransportError": 1, "RunError": 1}  # by name: their modules need not be installed
+    if isinstance(error, StorageError):
+        return _line(error, 1)
+    for kind in type(error).__mro__:
+        if kind.__name__ in known and kind.__module__.startswith("apex_bat."):
+            return _line(error, known[kind.__name__])
+    if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("apex_bat"):
+        print(f"apex-bat: {error.name} is not installed; pip install 'apex-bat[train]' brings it", file=sys.stderr)
+        return 1
+    raise error
+
+
+def _line(error: Exception, code: int) -> int:
+    print("apex-bat: " + str(error).replace("\n", " "), file=sys.stderr)
+    return code

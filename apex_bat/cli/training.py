@@ -1,0 +1,122 @@
+"""`apex-bat train`."""
+
+from __future__ import annotations
+
+import json
+import logging
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from apex_bat.config import Config, ConfigError, load
+
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="TOML file of settings; those that ship: configs/.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change one setting; repeatable. `none` means None."),
+]
+
+
+def train(
+    config_file: ConfigFile = None,
+    overrides: Overrides = None,
+    run: Annotated[
+        Path | None, typer.Option("--run", help="Run folder to make. [default: runs/NAME-DATE-TIME]")
+    ] = None,
+    plain: Annotated[bool, typer.Option("--plain", help="Plain lines instead of the live view.")] = False,
+) -> int:
+    """Train on this machine: actors, replay, learner and evaluator as processes; then evaluate the best checkpoint.
+
+    Ends at the first of train.max_minutes, train.max_env_steps and train.max_updates. Ctrl-C ends it early, with a last
+    checkpoint and snapshot; a second Ctrl-C kills.
+    """
+    from apex_bat.evaluation import runs
+    from apex_bat.launching import local
+    from apex_bat.launching.live import PlainView, view_for
+
+    config = load(config_file, overrides or ())
+    check(config)
+    folder = run or Path("runs") / f"{config_file.stem if config_file else 'default'}-{datetime.now():%Y%m%d-%H%M%S}"
+    console = Console()
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    runs.create(folder, config)
+    title = f"apex-bat train: {config.condition} in {config.arena}, seed {config.seed}, {folder}"
+    console.print(title, highlight=False, soft_wrap=True)
+    view = PlainView(console) if plain else view_for(console, title)
+    try:
+        outcome, reason = local.train(config, folder, view)
+    except BaseException as error:
+        runs.finish(folder, "failed", reason=str(error) or type(error).__name__)
+        raise
+    runs.finish(folder, outcome, reason=reason)
+    if outcome == "failed":
+        typer.echo(f"apex-bat: {reason}; the logs are in {folder / 'logs'}", err=True)
+        raise typer.Exit(1)
+    if outcome == "interrupted":
+        typer.echo(f"interrupted; the last checkpoint is in {folder / 'checkpoints'}", err=True)
+        raise typer.Exit(130)
+    conclude(folder, config, console)
+    return 0
+
+
+def check(config: Config) -> None:
+    """Refuses settings that no role could work with, before anything is started.
+
+    Raises:
+        ConfigError, ArenaError, TransportError: they name the setting.
+    """
+    from apex_bat.agent.inference import parameter_shapes
+    from apex_bat.simulation.arenas import load_arena
+    from apex_bat.transport.sockets import check_host
+
+    for arena in dict.fromkeys((config.arena, *config.evaluation.arenas)):
+        load_arena(arena)
+    try:
+        parameter_shapes(config.network, config.state_steps)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    check_host(config.transport.host, config.transport.keys)
+
+
+def conclude(folder: Path, config: Config, console: Console) -> None:
+    """Evaluates the best checkpoint of a run, records flights of it, prints the result and where everything is."""
+    from apex_bat.evaluation import runs
+    from apex_bat.recording.keeping import keep_flights
+
+    evaluation = config.evaluation
+    if not evaluation.arenas:
+        return
+    console.print(
+        f"evaluating the best checkpoint: {evaluation.flights} flights of "
+        f"{config.episode.evaluation_steps} steps in {', '.join(evaluation.arenas)}"
+    )
+    result, flights = runs.evaluate(
+        folder, evaluation.arenas, evaluation.flights, evaluation.start_seed,
+        num_recorded=config.recording.evaluation_flights,
+    )  # fmt: skip
+    (folder / "evaluation" / "final.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    keep_flights(flights, config, folder)
+    print_result(result, console)
+    console.print(f"run folder:  {folder}\nrecordings:  apex-bat inspect {folder}\n"
+                  f"pictures:    {folder / 'figures'}", highlight=False, soft_wrap=True)  # fmt: skip
+
+
+def print_result(result: dict[str, Any], console: Console) -> None:
+    """Prints the summary of an evaluation as a table."""
+    from rich.table import Table
+
+    title = f"{result['run']}: {result['condition']}, {result['checkpoint']}, update {result['learner_step']}"
+    table = Table(title=title, title_justify="left")
+    columns = ("arena", "complete", "steps", "distance [m]", "progress [m]", "straight [%]", "clearance [m]")
+    for name in columns:
+        table.add_column(name, justify="left" if name == "arena" else "right")
+    for row in result["summary"]:
+        table.add_row(
+            row["arena"], f"{row['completed']} of {row['flights']}", f"{row['steps_mean']:.0f}",
+            f"{row['distance_m_mean']:.1f}", f"{row['progress_m_mean']:.1f}",
+            f"{100 * row['straight_share_mean']:.0f}", f"{row['clearance_m_median']:.2f}",
+        )  # fmt: skip
+    console.print(table)

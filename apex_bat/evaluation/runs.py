@@ -1,0 +1,183 @@
+"""Run folders: making one, reading one, and judging the policy that it holds."""
+
+from __future__ import annotations
+
+import json
+import platform
+import socket
+import subprocess
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from apex_bat import config as configuration
+from apex_bat.agent.inference import Policy
+from apex_bat.config import Config
+from apex_bat.evaluation.flights import FlightRecord, fly
+from apex_bat.recording.flight import Flight
+from apex_bat.roles import checkpoint
+from apex_bat.storage import StorageError, write_text
+
+FOLDERS = ("metrics", "checkpoints", "replay", "recordings", "evaluation", "figures", "logs")
+
+
+class RunError(ValueError):
+    """A run folder that is missing, in use, not empty, or cannot be written."""
+
+
+def create(folder: Path, config: Config) -> None:
+    """Makes a run folder with its settings and the facts of its start.
+
+    Raises:
+        RunError: the folder holds a run already or cannot be written.
+    """
+    if (folder / "run.json").exists():
+        raise RunError(f"{folder}: holds a run already; name another folder with --run")
+    try:
+        for name in FOLDERS:
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        write_text(folder / "config.toml", configuration.dumps(config))
+        note(folder, outcome="running", start=_now(), seed=config.seed, host=socket.gethostname(), **_versions())
+    except (OSError, StorageError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise RunError(f"{folder}: the run folder cannot be written: {reason}; name another with --run") from None
+
+
+def note(folder: Path, **facts: Any) -> None:
+    """Adds facts to the folder's run.json.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    path = folder / "run.json"
+    known = json.loads(path.read_text()) if path.exists() else {}
+    write_text(path, json.dumps(known | facts, indent=2) + "\n")
+
+
+def finish(folder: Path, outcome: str, **facts: Any) -> None:
+    """Notes how a run ended."""
+    note(folder, outcome=outcome, end=_now(), **facts)
+
+
+def load_config(folder: Path) -> Config:
+    """Returns the settings of a run.
+
+    Raises:
+        RunError: there is no run in the folder.
+        ConfigError: its settings are not valid in this version.
+    """
+    if not (folder / "config.toml").exists():
+        raise RunError(f"{folder}: no run here (config.toml is missing)")
+    return configuration.load(folder / "config.toml")
+
+
+def best_checkpoint(folder: Path) -> Path:
+    """Returns the path of the best checkpoint, or of the newest if none was judged.
+
+    Raises:
+        RunError: there is none.
+    """
+    best = folder / "checkpoints" / checkpoint.BEST
+    if best.exists():
+        return best
+    newest = checkpoint.find(folder / "checkpoints")[-1:]
+    if not newest:
+        raise RunError(f"{folder}: there is no checkpoint to evaluate")
+    return newest[0]
+
+
+def evaluate(
+    folder: Path,
+    arenas: Sequence[str],
+    num_flights: int,
+    seed: int,
+    *,
+    num_recorded: int = 0,
+    path: Path | None = None,
+) -> tuple[dict[str, Any], list[Flight]]:
+    """Flies the best policy of a run and returns the result, ready for JSON, and the recorded flights.
+
+    Raises:
+        RunError: the folder holds no run or no checkpoint.
+        StorageError: the checkpoint cannot be read.
+    """
+    config = load_config(folder)
+    path = path or best_checkpoint(folder)
+    found = checkpoint.load(path)
+    policy = Policy(config.network, config.state_steps)
+    policy.load(found.policy_parameters())
+    began_s = time.perf_counter()
+    records: list[FlightRecord] = []
+    flights: list[Flight] = []
+    for arena in arenas:
+        flown, recorded = fly(
+            policy, config, arena, num_flights=num_flights, seed=seed, num_recorded=num_recorded,
+            checkpoint_step=found.learner_step,
+        )  # fmt: skip
+        records += flown
+        flights += recorded
+    result = {
+        "run": folder.name,
+        "checkpoint": path.name,
+        "learner_step": found.learner_step,
+        "condition": config.condition,
+        "rendering": config.sonar.rendering,
+        "training_seed": config.seed,
+        "wall_s": round(time.perf_counter() - began_s, 3),
+        "summary": [summary([record for record in records if record.arena == arena], arena) for arena in arenas],
+        "flights": [msgspec.to_builtins(record) for record in records],
+    }
+    return result, flights
+
+
+def summary(records: Sequence[FlightRecord], arena: str) -> dict[str, Any]:
+    """Returns the figures of the flights in one arena."""
+    return {
+        "arena": arena,
+        "flights": len(records),
+        "completed": sum(record.completed for record in records),
+        "steps_mean": float(np.mean([record.steps for record in records])),
+        "distance_m_mean": float(np.mean([record.distance_m for record in records])),
+        "progress_m_mean": float(np.mean([record.progress_m for record in records])),
+        "straight_share_mean": float(np.mean([record.action_shares[0] for record in records])),
+        "clearance_m_median": float(np.median([record.clearance_quantiles_m[3] for record in records])),
+    }
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _versions() -> dict[str, Any]:
+    packages = ("apex-bat", "gymnasium", "numpy", "pybullet", "pyzmq", "rerun-sdk", "torch")
+    versions = {name: _version(name) for name in packages}
+    return {"python": platform.python_version(), "platform": platform.platform(), "versions": versions,
+            "commit": _commit()}  # fmt: skip
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """Returns the commit of the source tree, with a plus if it was changed; None outside a checkout."""
+    source = Path(__file__).resolve().parent
+    try:
+        commit = _git("rev-parse", "HEAD", source=source)
+        return commit + ("+" if _git("status", "--porcelain", source=source) else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _git(*arguments: str, source: Path) -> str:
+    command = ["git", "-C", str(source), *arguments]
+    return subprocess.run(command, capture_output=True, check=True, text=True, timeout=5.0).stdout.strip()  # noqa: S603

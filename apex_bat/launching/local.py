@@ -1,0 +1,166 @@
+"""Training on this machine: every role a process, watched until a limit is reached, Ctrl-C, or a role is given up."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import Literal
+
+import msgspec
+
+from apex_bat.config import Config
+from apex_bat.launching.live import View
+from apex_bat.launching.processes import RoleProcess
+from apex_bat.launching.standing import Standing
+from apex_bat.launching.supervisor import RoleFailedError, Supervisor
+from apex_bat.recording.metrics import MetricsWriter
+from apex_bat.roles.plan import Addresses, Role, roles_of
+from apex_bat.roles.process import ADDRESSES
+from apex_bat.storage import StorageError, write_text
+from apex_bat.transport.reports import ReportCollector
+from apex_bat.transport.sockets import free_ports
+
+STATUS = "status.json"
+STATUS_PERIOD_S = 1.0
+_MAX_IPC_PATH = 90  # a Unix socket's path holds 107 bytes
+_log = logging.getLogger(__name__)
+
+Outcome = Literal["completed", "interrupted", "failed"]
+
+
+def train(config: Config, run: Path, view: View) -> tuple[Outcome, str]:
+    """Trains in a run folder made by `runs.create` and returns how it ended and, if it failed, why in one line."""
+    with _terminable(), _addresses(config, run) as addresses:
+        write_text(run / ADDRESSES, msgspec.json.encode(addresses).decode())
+        collector = ReportCollector(addresses.reports)
+        launch = _Launch(config, run, collector)
+        try:
+            with view:
+                outcome, reason = launch.follow(view)
+        finally:
+            launch.end()
+            collector.close()
+    return outcome, reason
+
+
+class _Launch:
+    """The processes of one run and what they report."""
+
+    def __init__(self, config: Config, run: Path, collector: ReportCollector) -> None:
+        self._config, self._run, self._collector = config, run, collector
+        self._supervisor = Supervisor(roles_of(config), self._start, config.launch)
+        self._standing = Standing(config, time.monotonic())
+        self._metrics = MetricsWriter(run / "metrics")
+        self._status_due_s = 0.0
+
+    def follow(self, view: View) -> tuple[Outcome, str]:
+        """Watches the run until it is over."""
+        try:
+            self._supervisor.start(time.monotonic())
+            while not (self._standing.is_over or self._supervisor.is_done("learner")):
+                self._take_reports(0.1)
+                self._supervisor.watch(self._standing.now_s)
+                view.show(self._standing, self._supervisor.watched)
+        except KeyboardInterrupt:
+            return "interrupted", "interrupted"
+        except (RoleFailedError, StorageError) as error:
+            return "failed", str(error)
+        return "completed", ""
+
+    def end(self) -> None:
+        """Stops the roles, the replay last, and kills what outlives its grace."""
+        try:
+            names = list(self._supervisor.watched)
+            self._end([name for name in names if name != "replay"], self._config.launch.grace_s)
+            self._end(["replay"], self._config.launch.grace_s)
+        except KeyboardInterrupt:
+            _log.warning("interrupted again: killing the roles")
+        finally:
+            for watched in self._supervisor.watched.values():
+                if watched.handle is not None:
+                    watched.handle.kill()
+            with suppress(StorageError):
+                self._write_status()
+            self._metrics.close()
+
+    def _start(self, role: Role, incarnation: int) -> RoleProcess:
+        threads = self._config.train.threads if role.kind == "learner" else 1
+        return RoleProcess(role, self._run, incarnation, threads)
+
+    def _take_reports(self, timeout_s: float) -> None:
+        reports = self._collector.poll(timeout_s)
+        now_s = self._standing.now_s = time.monotonic()
+        for report in reports:
+            self._standing.take(report, now_s)
+            self._supervisor.heard(report.role, report.pid, now_s)
+            self._metrics.append(
+                report, self._standing.elapsed_s, self._standing.env_steps, self._standing.learner_step
+            )
+        if now_s >= self._status_due_s:
+            self._status_due_s = now_s + STATUS_PERIOD_S
+            self._write_status()
+
+    def _write_status(self) -> None:
+        roles = self._standing.status(self._supervisor.watched)
+        content = {"launcher_pid": os.getpid(), "written_unix_s": time.time(), "roles": roles}
+        write_text(self._run / STATUS, json.dumps(content, indent=1))
+
+    def _end(self, names: Sequence[str], grace_s: float) -> None:
+        running = self._supervisor.stop(names)
+        deadline_s = time.monotonic() + grace_s
+        while running and time.monotonic() < deadline_s:
+            self._take_reports(0.05)
+            for watched in running:
+                ended = watched.handle.poll() if watched.handle is not None else None
+                if ended is not None:
+                    watched.handle, watched.is_done = None, True
+            running = [watched for watched in running if watched.handle is not None]
+        for watched in running:
+            _log.warning("%s: did not end within %g s; killed", watched.role.name, grace_s)
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Makes SIGTERM and a closed terminal end a run in the same way as Ctrl-C."""
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    former = {number: signal.signal(number, interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _addresses(config: Config, run: Path) -> Iterator[Addresses]:
+    """Yields the endpoints of a run; sockets of `ipc` lie in a folder that only this user can enter.
+
+    Raises:
+        TransportError: no port could be had.
+    """
+    if config.transport.host != "ipc":
+        host, ports = config.transport.host, free_ports(config.transport.host, 3, config.transport.base_port)
+        yield Addresses(*(f"tcp://{host}:{port}" for port in ports))
+        return
+    folder = run.resolve() / "sockets"
+    if len(os.fsencode(folder)) > _MAX_IPC_PATH:
+        folder = Path(tempfile.mkdtemp(prefix="apex_bat-"))
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(mode=0o700)
+    try:
+        yield Addresses(*(f"ipc://{folder / name}" for name in ("replay", "weights", "reports")))
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

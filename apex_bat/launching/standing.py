@@ -1,0 +1,142 @@
+"""How a run stands: what the roles' reports add up to. The views, status.json and the limits read it."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from apex_bat.config import Config
+from apex_bat.launching.supervisor import Watched
+from apex_bat.roles.plan import roles_of
+from apex_bat.transport.messages import Report
+
+_RECENT_REPORTS = 30
+
+
+class RoleStanding:
+    """What is known of one role."""
+
+    def __init__(self) -> None:
+        self.newest: Report | None = None
+        self.heard_s: float | None = None
+        self._before: dict[str, float] = {}
+
+    def take(self, report: Report, now_s: float) -> None:
+        """Takes a report; the counters of a former process are added to those of the new one."""
+        if self.newest is not None and self.newest.pid != report.pid:
+            for name, value in self.newest.metrics.items():
+                self._before[name] = self._before.get(name, 0.0) + value
+        self.newest, self.heard_s = report, now_s
+
+    def total(self, name: str) -> float:
+        """Returns a counter over all processes that the role has had."""
+        return self._before.get(name, 0.0) + self.gauge(name, 0.0)
+
+    def gauge(self, name: str, default: float = float("nan")) -> float:
+        """Returns a figure of the newest report."""
+        return default if self.newest is None else self.newest.metrics.get(name, default)
+
+
+class Standing:
+    """How the run stands at a moment."""
+
+    def __init__(self, config: Config, now_s: float) -> None:
+        self.config = config
+        self.roles = {role.name: RoleStanding() for role in roles_of(config)}
+        self.began_s = now_s
+        self.now_s = now_s
+        self.flying_since_s: float | None = None
+        self._recent: dict[str, deque[tuple[float, float]]] = {
+            name: deque(maxlen=_RECENT_REPORTS * config.actors) for name in ("return", "return_greedy")
+        }
+
+    def take(self, report: Report, now_s: float) -> None:
+        """Takes the report of a role; one of a role that the run does not have is ignored."""
+        if report.role not in self.roles:
+            return
+        self.roles[report.role].take(report, now_s)
+        for name, recent in self._recent.items():
+            if name in report.metrics:
+                recent.append((report.metrics[name], report.metrics.get(f"{name}_count", 1.0)))
+        if self.flying_since_s is None and self.env_steps > 0:
+            self.flying_since_s = now_s
+
+    @property
+    def env_steps(self) -> float:
+        """Environment steps of all bats."""
+        return self._sum("env_steps")
+
+    @property
+    def env_steps_per_s(self) -> float:
+        """Their present rate."""
+        return sum(role.gauge("env_steps_per_s", 0.0) for role in self.roles.values())
+
+    @property
+    def episodes(self) -> float:
+        """Episodes ended."""
+        return self._sum("episodes")
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since the first environment step."""
+        return 0.0 if self.flying_since_s is None else self.now_s - self.flying_since_s
+
+    @property
+    def learner_step(self) -> float:
+        """Updates of the network."""
+        return self.roles["learner"].gauge("learner_step", 0.0)
+
+    def recent(self, name: str) -> float | None:
+        """Returns the mean of `return` or `return_greedy` over the newest reports; None before the first."""
+        values = self._recent[name]
+        number = sum(count for _, count in values)
+        return sum(mean * count for mean, count in values) / number if number else None
+
+    @property
+    def limits(self) -> list[tuple[str, float, float]]:
+        """For each limit of the run: its name, how far it is used, and how far it goes."""
+        train = self.config.train
+        return [
+            (name, used, float(limit))
+            for name, used, limit in (
+                ("minutes", self.elapsed_s / 60.0, train.max_minutes),
+                ("env steps", self.env_steps, train.max_env_steps),
+                ("updates", self.learner_step, train.max_updates),
+            )
+            if limit is not None
+        ]
+
+    @property
+    def time_left_s(self) -> float | None:
+        """Estimate of the time until the first limit is reached; None before the first step."""
+        shares = [used / limit for _, used, limit in self.limits]
+        share = max(shares)
+        return None if share <= 0.0 else self.elapsed_s * (1.0 - share) / share
+
+    @property
+    def is_over(self) -> bool:
+        """Whether a limit is reached."""
+        return any(used >= limit for _, used, limit in self.limits)
+
+    def status(self, watched: dict[str, Watched]) -> list[dict[str, Any]]:
+        """Returns each role's standing as `status --json` prints it."""
+        return [self._status(name, watched[name]) for name in self.roles]
+
+    def _status(self, name: str, watched: Watched) -> dict[str, Any]:
+        known = self.roles[name]
+        report = known.newest
+        state = "ended" if watched.is_done else "starting" if watched.handle is not None else "waiting to be restarted"
+        current = report is not None and watched.handle is not None and report.pid == watched.handle.pid
+        return {
+            "role": name,
+            "pid": watched.handle.pid if watched.handle is not None else None,
+            "host": report.host if report is not None else None,
+            "address": report.address if report is not None else None,
+            "restarts": watched.restarts,
+            "heartbeat_age_s": None if known.heard_s is None else round(self.now_s - known.heard_s, 2),
+            "state": report.state if current and report is not None and not watched.is_done else state,
+            "metrics": report.metrics if report is not None else {},
+        }
+
+    def _sum(self, name: str) -> float:
+        return sum(role.total(name) for role in self.roles.values())

@@ -1,0 +1,151 @@
+"""Watching roles and starting them again: the policy, whatever the roles run on.
+
+A role that ends unasked is started again after a backoff that doubles with each quick failure; one that stays silent
+is killed first. A role that fails too often in a row, or says that trying again is useless, ends the run.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, Protocol
+
+from apex_bat.config.settings import Launch
+from apex_bat.roles.plan import Role
+
+USELESS = 2
+"""Exit code by which a role says that starting it again would fail in the same way."""
+QUICK_S = 60.0
+MAX_BACKOFF_S = 30.0
+_log = logging.getLogger(__name__)
+
+
+class Exit(NamedTuple):
+    """How a role ended."""
+
+    code: int
+    """Exit code; negative: the signal that killed it."""
+    detail: str
+    """What it said last, for the one line that a person reads."""
+
+
+class Handle(Protocol):
+    """A started role."""
+
+    @property
+    def pid(self) -> int:
+        """Number of its process."""
+
+    def poll(self) -> Exit | None:
+        """Returns how it ended, or None while it runs."""
+
+    def stop(self) -> None:
+        """Asks it to end."""
+
+    def kill(self) -> None:
+        """Ends it at once."""
+
+
+class RoleFailedError(RuntimeError):
+    """A role failed beyond its budget; the text says which, why, and where its log is."""
+
+
+class Watched:
+    """One role of the run and its present process."""
+
+    def __init__(self, role: Role) -> None:
+        self.role = role
+        self.handle: Handle | None = None
+        self.restarts = 0
+        self.failures_in_a_row = 0
+        self.started_s = 0.0
+        self.heard_s = 0.0
+        self.due_s: float | None = None
+        """When it is to be started again; None while it runs or when it is done."""
+        self.is_done = False
+
+
+class Supervisor:
+    """Starts the roles, restarts what fails and stops them all."""
+
+    def __init__(self, roles: Iterable[Role], start: Callable[[Role, int], Handle], launch: Launch) -> None:
+        """`start(role, incarnation)` starts a role; times are handed in, so that tests can drive them."""
+        self.watched = {role.name: Watched(role) for role in roles}
+        self._start = start
+        self._launch = launch
+
+    def start(self, now_s: float) -> None:
+        """Starts every role."""
+        for watched in self.watched.values():
+            self._begin(watched, now_s)
+
+    def heard(self, name: str, pid: int, now_s: float) -> None:
+        """Notes a sign of life; one of a former process is ignored."""
+        watched = self.watched.get(name)
+        if watched is not None and watched.handle is not None and watched.handle.pid == pid:
+            watched.heard_s = now_s
+
+    def watch(self, now_s: float) -> None:
+        """Notices what ended or fell silent, and starts again what is due.
+
+        Raises:
+            RoleFailedError: a role is beyond its budget.
+        """
+        for watched in self.watched.values():
+            if watched.handle is not None:
+                self._check(watched, watched.handle, now_s)
+            elif watched.due_s is not None and now_s >= watched.due_s:
+                watched.restarts += 1
+                self._begin(watched, now_s)
+
+    def is_done(self, name: str) -> bool:
+        """Whether a role has ended by itself, with exit code 0."""
+        return self.watched[name].is_done
+
+    def stop(self, names: Iterable[str]) -> list[Watched]:
+        """Asks some roles to end and returns those that run; they are not started again."""
+        chosen = [self.watched[name] for name in names]
+        for watched in chosen:
+            watched.due_s = None
+            if watched.handle is not None:
+                watched.handle.stop()
+        return [watched for watched in chosen if watched.handle is not None]
+
+    def _begin(self, watched: Watched, now_s: float) -> None:
+        watched.handle = self._start(watched.role, watched.restarts)
+        watched.started_s = watched.heard_s = now_s
+        watched.due_s = None
+
+    def _check(self, watched: Watched, handle: Handle, now_s: float) -> None:
+        ended = handle.poll()
+        if ended is None:
+            silent_s = now_s - watched.heard_s
+            if silent_s > self._launch.heartbeat_timeout_s:
+                _log.warning("%s: silent for %.0f s; killed and replaced", watched.role.name, silent_s)
+                handle.kill()
+            return
+        watched.handle = None
+        if ended.code == 0:
+            watched.is_done = True
+            return
+        quick = now_s - watched.started_s < QUICK_S
+        watched.failures_in_a_row = watched.failures_in_a_row + 1 if quick else 1
+        self._judge(watched, ended)
+        wait_s = min(self._launch.backoff_s * 2.0 ** (watched.failures_in_a_row - 1), MAX_BACKOFF_S)
+        watched.due_s = now_s + wait_s
+        _log.warning("%s: %s; starts again in %.1f s", watched.role.name, describe(ended), wait_s)
+
+    def _judge(self, watched: Watched, ended: Exit) -> None:
+        name = watched.role.name
+        if ended.code == USELESS:
+            raise RoleFailedError(ended.detail or f"{name} cannot work with these settings")
+        if watched.failures_in_a_row > self._launch.max_failures:
+            raise RoleFailedError(
+                f"{name}: given up after {watched.failures_in_a_row} quick failures, the last: {describe(ended)}"
+            )
+
+
+def describe(ended: Exit) -> str:
+    """Returns a few words on how a role ended."""
+    how = f"killed by signal {-ended.code}" if ended.code < 0 else f"failed with exit code {ended.code}"
+    return f"{how}: {ended.detail}" if ended.detail and ended.code > 0 else how

@@ -1,0 +1,191 @@
+"""The actor: flies its bats in step, turns their flight into prioritized transitions and pushes them to the replay.
+
+Every bat keeps its own epsilon of the ladder. First priorities come from the actor's own weights (Horgan et al. 2018,
+algorithm 1), which are exchanged for newer ones every `actor.weights_period` steps.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from apex_bat.agent.exploration import GREEDY_EPSILON, annealed, choose_actions, ladder_of_actor
+from apex_bat.agent.inference import Policy, PolicyValues
+from apex_bat.agent.n_step import Accumulator
+from apex_bat.experience import Chunk, States
+from apex_bat.replay.client import ReplayWriter
+from apex_bat.roles.plan import Assignment
+from apex_bat.roles.reporting import Phases, RoleReporter
+from apex_bat.simulation.vector import EchoFlightVector
+from apex_bat.transport.weights import WeightsSubscriber
+
+Observation = dict[str, NDArray[np.generic]]
+_log = logging.getLogger(__name__)
+_WAIT_S = 0.2
+
+
+def run_actor(assignment: Assignment) -> None:
+    """Flies until told to stop."""
+    actor = Actor(assignment)
+    try:
+        while not assignment.stop.is_set():
+            if actor.is_ready(_WAIT_S):
+                actor.step()
+        actor.flush(timeout_s=1.0)
+    finally:
+        actor.close()
+
+
+class Actor:
+    """The state of one actor: bats, policy, accumulators and the line to the replay."""
+
+    def __init__(self, assignment: Assignment) -> None:
+        config, role = assignment.config, assignment.role
+        self._config = config
+        self._generator = assignment.generator()
+        self._env = EchoFlightVector(
+            config.bats_per_actor, config.arena, config.condition, body=config.body, rays=config.rays,
+            sonar=config.sonar, sensing=config.sensing, episode=config.episode, autoreset_mode=AutoresetMode.DISABLED,
+        )  # fmt: skip
+        self._epsilons = ladder_of_actor(role.number, config.actors, config.bats_per_actor, config.exploration)
+        self._accumulators = [
+            Accumulator(
+                config.learner.num_step, config.learner.discount, config.state_steps, config.actor.chunk_transitions
+            )
+            for _ in range(config.bats_per_actor)
+        ]
+        self._policy = Policy(config.network, config.state_steps)
+        self._learner_step = -1
+        self._weights = WeightsSubscriber(assignment.addresses.weights, self._policy.shapes)
+        actor = f"{role.name}.{assignment.incarnation}"
+        self._writer = ReplayWriter(assignment.addresses.replay, actor, config.actor.window_chunks)
+        self._reporter = RoleReporter(assignment)
+        self._phases = Phases("simulation", "policy", "gathering")
+        self._num_steps = 0
+        self._waiting_since: float | None = None
+        self._observation: Observation | None = None
+        self._values: PolicyValues
+        self._frames: NDArray[np.float32]
+        self._returns = np.zeros(config.bats_per_actor)
+
+    def is_ready(self, timeout_s: float) -> bool:
+        """Says whether a step can be taken now; else waits for weights or for the replay, and reports for whom."""
+        self._writer.poll(0.0)
+        if self._learner_step < 0 and not self._take_up_weights(timeout_s):
+            return self._wait("waiting for the learner's first weights")
+        if not self._writer.has_room:
+            self._writer.poll(timeout_s)
+            if not self._writer.has_room:
+                return self._wait("waiting for the replay server to accept chunks")
+        if self._observation is None:
+            self._begin()
+        return True
+
+    def step(self) -> None:
+        """Takes one step of all bats."""
+        env, reporter = self._env, self._reporter
+        actions = choose_actions(self._values.q, self._current_epsilons(), self._generator)
+        with self._phases.of("simulation"):
+            observation, rewards, terminated, truncated, _ = env.step(actions)
+        with self._phases.of("policy"):
+            values = self._policy(_states(observation))
+        ended = terminated | truncated
+        with self._phases.of("gathering"):
+            chunks = self._gather(actions, rewards, values, env.newest_frames, terminated, ended)
+            if chunks:
+                self._writer.send(chunks, self._learner_step)
+        self._returns += rewards
+        self._frames, self._observation, self._values = env.newest_frames.copy(), observation, values
+        if ended.any():
+            self._end_episodes(ended)
+        self._num_steps += 1
+        reporter.count("env_steps", len(actions))
+        if self._num_steps % self._config.actor.weights_period == 0:
+            self._take_up_weights(0.0)
+        if reporter.is_due:
+            self._report("flying")
+
+    def flush(self, timeout_s: float) -> None:
+        """Waits until the server has acknowledged everything, at most so long."""
+        self._writer.flush(timeout_s)
+
+    def close(self) -> None:
+        """Closes the world and the sockets."""
+        self._env.close()
+        self._writer.close()
+        self._weights.close()
+        self._reporter.close()
+
+    def _begin(self) -> None:
+        observation, _ = self._env.reset(seed=int(self._generator.integers(2**31)))
+        self._observation, self._values = observation, self._policy(_states(observation))
+        self._frames = self._env.newest_frames.copy()
+
+    def _current_epsilons(self) -> NDArray[np.float64]:
+        if self._config.exploration.kind == "ladder":
+            return self._epsilons
+        steps = self._num_steps * self._config.bats_per_actor * self._config.actors
+        return np.full(self._config.bats_per_actor, annealed(steps, self._config.exploration))
+
+    def _gather(
+        self,
+        actions: NDArray[np.int64],
+        rewards: NDArray[np.float64],
+        values: PolicyValues,
+        next_frames: NDArray[np.float32],
+        terminated: NDArray[np.bool_],
+        ended: NDArray[np.bool_],
+    ) -> list[Chunk]:
+        q_taken = np.take_along_axis(self._values.q, actions[:, None], axis=1)[:, 0].tolist()
+        next_q_max = values.q.max(axis=1).tolist()
+        chunks = []
+        for bat, accumulator in enumerate(self._accumulators):
+            accumulator.step(self._frames[bat], int(actions[bat]), float(rewards[bat]), q_taken[bat], next_q_max[bat])
+            if ended[bat]:
+                chunk = accumulator.end(next_frames[bat], bool(terminated[bat]))
+            else:
+                chunk = accumulator.full_chunk(next_frames[bat])
+            if chunk is not None:
+                chunks.append(chunk)
+        return chunks
+
+    def _end_episodes(self, ended: NDArray[np.bool_]) -> None:
+        epsilons = self._current_epsilons()
+        for bat in np.flatnonzero(ended):
+            self._reporter.count("episodes", 1)
+            self._reporter.average("return", float(self._returns[bat]))
+            if epsilons[bat] < GREEDY_EPSILON:
+                self._reporter.average("return_greedy", float(self._returns[bat]))
+        self._returns[ended] = 0.0
+        observation, _ = self._env.reset(options={"reset_mask": ended})
+        fresh = self._policy(States(*(array[ended] for array in _states(observation))))
+        for values, new in zip(self._values, fresh, strict=True):
+            values[ended] = new
+        self._observation, self._frames = observation, self._env.newest_frames.copy()
+
+    def _take_up_weights(self, timeout_s: float) -> bool:
+        weights = self._weights.newest(timeout_s)
+        if weights is None:
+            return False
+        self._policy.load(weights.arrays)
+        self._learner_step = weights.learner_step
+        return True
+
+    def _wait(self, reason: str) -> bool:
+        self._reporter.count("waits", 1)
+        if self._reporter.is_due:
+            self._report(reason)
+        return False
+
+    def _report(self, state: str) -> None:
+        self._reporter.gauge("learner_step", self._learner_step)
+        for name, value in self._writer.metrics().items():
+            self._reporter.gauge(name, value)
+        self._reporter.send(state, self._phases)
+
+
+def _states(observation: Observation) -> States:
+    return States(observation["echoes"].astype(np.float32, copy=False), observation["actions"].astype(np.uint8))

@@ -1,0 +1,119 @@
+"""Checkpoints of the learner: what they hold, how they are named, found, kept and judged."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import shutil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_bat.config import Config
+from apex_bat.storage import StorageError, read_arrays, write_arrays, write_text
+
+KIND = "apex_bat checkpoint 1"
+BEST = "best.npz"
+_NAME = re.compile(r"step-(\d{9})\.npz")
+_log = logging.getLogger(__name__)
+
+
+class Checkpoint(NamedTuple):
+    """A learner at one moment."""
+
+    learner_step: int
+    """Updates made."""
+    fingerprint: dict[str, Any]
+    """The settings that a policy depends on, see `fingerprint`."""
+    counters: dict[str, Any]
+    """Whatever else the learner continues from: weights version, random states."""
+    arrays: dict[str, NDArray[Any]]
+    """`online/...`, `target/...` and `optimiser/...`."""
+
+    def policy_parameters(self) -> dict[str, NDArray[np.float32]]:
+        """Returns the online network's parameters by name."""
+        return {k.removeprefix("online/"): v for k, v in self.arrays.items() if k.startswith("online/")}
+
+
+def fingerprint(config: Config) -> dict[str, Any]:
+    """Returns the settings that a checkpoint must share with the run that loads it: network and sensing."""
+    settings = (config.network, config.sensing, config.condition, config.sonar.rendering)
+    names = ("network", "sensing", "condition", "rendering")
+    return {name: json.loads(msgspec.json.encode(value)) for name, value in zip(names, settings, strict=True)}
+
+
+def save(folder: Path, checkpoint: Checkpoint, keep: int) -> Path:
+    """Writes a checkpoint as `step-N.npz` and removes all but the newest `keep`; returns its path.
+
+    Raises:
+        StorageError: it could not be written; older ones are untouched.
+    """
+    path = folder / f"step-{checkpoint.learner_step:09d}.npz"
+    header = {
+        "learner_step": checkpoint.learner_step,
+        "fingerprint": checkpoint.fingerprint,
+        "counters": checkpoint.counters,
+    }
+    write_arrays(path, KIND, header, checkpoint.arrays)
+    for old in find(folder)[:-keep]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def load(path: Path) -> Checkpoint:
+    """Reads a checkpoint.
+
+    Raises:
+        StorageError: the file is missing, torn or not a checkpoint.
+    """
+    header, arrays = read_arrays(path, KIND)
+    return Checkpoint(int(header["learner_step"]), header["fingerprint"], header["counters"], arrays)
+
+
+def load_newest(folder: Path) -> Checkpoint | None:
+    """Returns the newest checkpoint that can be read, saying in the log which could not; None if there is none.
+
+    Raises:
+        StorageError: there are checkpoints, and none of them can be read.
+    """
+    paths = find(folder)
+    for path in reversed(paths):
+        try:
+            return load(path)
+        except StorageError as error:
+            _log.warning("%s; the one before it is used", error)
+    if paths:
+        raise StorageError(f"{folder}: none of the {len(paths)} checkpoints can be read")
+    return None
+
+
+def find(folder: Path) -> list[Path]:
+    """Returns the paths of the numbered checkpoints, oldest first."""
+    return sorted(path for path in folder.glob("step-*.npz") if _NAME.fullmatch(path.name))
+
+
+def step_of(path: Path) -> int:
+    """Returns the learner step in a checkpoint's name."""
+    match = _NAME.fullmatch(path.name)
+    if match is None:
+        raise ValueError(f"{path.name} is not the name of a checkpoint")
+    return int(match[1])
+
+
+def mark_best(folder: Path, path: Path, score: tuple[float, ...]) -> bool:
+    """Keeps a copy of a checkpoint as the best if its score is at least that of the best so far; says whether."""
+    note = folder / "best.json"
+    if note.exists() and tuple(json.loads(note.read_text())["score"]) > score:
+        return False
+    beside = folder / ".best.part"
+    try:
+        shutil.copyfile(path, beside)
+        beside.replace(folder / BEST)
+    except FileNotFoundError:  # it was removed while it was judged
+        return False
+    write_text(note, json.dumps({"score": score, "checkpoint": path.name}))
+    return True

@@ -1,0 +1,98 @@
+"""The dueling network, and its twin in numpy."""
+
+import numpy as np
+import pytest
+import torch
+
+from apex_bat.agent.inference import Policy, parameter_shapes
+from apex_bat.agent.network import DuelingNetwork, load_parameters, parameters_of
+from apex_bat.config.settings import Network
+from apex_bat.experience import States
+
+
+def random_states(batch: int, memory_steps: int = 3) -> States:
+    generator = np.random.default_rng(3)
+    echoes = generator.random((batch, 2 * memory_steps, 24), np.float32)
+    return States(echoes, generator.integers(0, 3, (batch, 3)).astype(np.uint8))
+
+
+def values_of(network: DuelingNetwork, states: States) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    with torch.no_grad():
+        values = network(torch.from_numpy(states.echoes), torch.from_numpy(states.actions))
+    return values.q.numpy(), values.value.numpy(), values.advantage.numpy()
+
+
+NETWORKS = [
+    Network(),
+    Network(dueling="max"),
+    Network(channels=(4,), strides=(1,), hidden=()),
+    Network(channels=(4, 5, 6), strides=(2, 1, 3), hidden=(16, 8), dropout=0.3, input_scale=2.0),
+]
+
+
+@pytest.mark.parametrize("settings", NETWORKS)
+@pytest.mark.parametrize("memory_steps", [1, 3, 5])
+def test_numpy_policy_computes_the_same_values_as_torch(settings: Network, memory_steps: int) -> None:
+    torch.manual_seed(1)
+    network = DuelingNetwork(settings, memory_steps).eval()
+    policy = Policy(settings, memory_steps)
+    policy.load(parameters_of(network))
+    states = random_states(5, memory_steps)
+    for ours, theirs in zip(policy(states), values_of(network, states), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=2e-6)
+
+
+@pytest.mark.parametrize("settings", NETWORKS)
+def test_declared_shapes_are_those_of_the_network(settings: Network) -> None:
+    network = DuelingNetwork(settings, 3)
+    assert parameter_shapes(settings, 3) == {name: tuple(p.shape) for name, p in network.state_dict().items()}
+
+
+def test_mean_form_centres_advantages_and_max_form_makes_value_the_best_action() -> None:
+    states = random_states(4)
+    q, value, _ = values_of(DuelingNetwork(Network(dueling="mean"), 3), states)
+    np.testing.assert_allclose(q.mean(axis=1, keepdims=True), value, atol=1e-6)
+    q, value, _ = values_of(DuelingNetwork(Network(dueling="max"), 3), states)
+    np.testing.assert_allclose(q.max(axis=1, keepdims=True), value, atol=1e-6)
+
+
+def test_filters_treat_each_echo_row_by_itself() -> None:
+    network = DuelingNetwork(Network(), 3)
+    states = random_states(1)
+    features = []
+    hook = network.filters[-1].register_forward_hook(lambda _m, _i, output: features.append(output.detach().numpy()))
+    values_of(network, states)
+    states.echoes[0, 2] += 1.0  # one row changes
+    values_of(network, states)
+    hook.remove()
+    changed = np.abs(features[1] - features[0]).max(axis=(0, 1, 3)) > 0.0
+    np.testing.assert_array_equal(changed, [False, False, True, False, False, False])
+
+
+def test_action_memory_matters() -> None:
+    network = DuelingNetwork(Network(), 3)
+    states = random_states(1)
+    before = values_of(network, states)[0]
+    states.actions[0, 1] = (states.actions[0, 1] + 1) % 3
+    assert np.abs(values_of(network, states)[0] - before).max() > 0.0
+
+
+def test_dropout_acts_in_training_only() -> None:
+    network = DuelingNetwork(Network(dropout=0.5), 3)
+    states = random_states(1)
+    assert not np.array_equal(values_of(network, states)[0], values_of(network, states)[0])
+    network.eval()
+    np.testing.assert_array_equal(values_of(network, states)[0], values_of(network, states)[0])
+
+
+def test_strides_that_leave_nothing_are_refused() -> None:
+    with pytest.raises(ValueError, match="leave nothing"):
+        parameter_shapes(Network(channels=(4, 4, 4), strides=(3, 3, 3)), 3)
+
+
+def test_weights_of_another_network_are_refused_by_name() -> None:
+    arrays = parameters_of(DuelingNetwork(Network(hidden=(64,)), 3))
+    with pytest.raises(ValueError, match=r"advantage\.0\.bias is \(64,\), needed \(128,\)"):
+        Policy(Network(), 3).load(arrays)
+    with pytest.raises(ValueError, match="another network"):
+        load_parameters(DuelingNetwork(Network(), 3), arrays)

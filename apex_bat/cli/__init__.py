@@ -14,6 +14,8 @@ from apex_bat import __version__
 from apex_bat.cli import judging, roles, training
 from apex_bat.config import ConfigError
 
+_USAGE_ERROR = typer.BadParameter.__mro__[2]  # the class of all usage errors, which typer does not export
+
 app = typer.Typer(
     name="apex-bat",
     help="Train an artificial bat that flies by its echoes, on many processes (Ape-X), and look at how it flies.",
@@ -56,15 +58,13 @@ def main() -> int:
 
 def _report(error: Exception) -> int:
     """Prints a known error as one line and returns the exit code; an unknown one goes on as a traceback."""
-    import click
-
     from apex_bat.storage import StorageError
 
-    if isinstance(error, click.exceptions.Abort):
+    if isinstance(error, typer.Abort):
         return 130
-    if isinstance(error, click.ClickException):
+    if isinstance(error, _USAGE_ERROR):
         error.show()
-        return error.exit_code
+        return 2
     if isinstance(error, ConfigError):
         return _line(error, 2)
     known = {"ArenaError": 2, "TransportError": 1, "RunError": 1}  # by name: their modules need not be installed

@@ -70,7 +70,8 @@ def check(config: Config) -> None:
     """
     from apex_bat.agent.inference import parameter_shapes
     from apex_bat.simulation.arenas import load_arena
-    from apex_bat.transport.sockets import check_host
+    from apex_bat.transport.security import load_keys
+    from apex_bat.transport.sockets import check_address
 
     for arena in dict.fromkeys((config.arena, *config.evaluation.arenas)):
         load_arena(arena)
@@ -78,7 +79,9 @@ def check(config: Config) -> None:
         parameter_shapes(config.network, config.state_steps)
     except ValueError as error:
         raise ConfigError(str(error)) from None
-    check_host(config.transport.host, config.transport.keys)
+    keys = load_keys(Path(config.transport.keys)) if config.transport.keys else None
+    if config.transport.host != "ipc":
+        check_address(f"tcp://{config.transport.host}:{config.transport.base_port}", keys)
 
 
 def conclude(folder: Path, config: Config, console: Console) -> None:

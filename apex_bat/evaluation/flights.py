@@ -90,7 +90,7 @@ def fly(
             ended = flying & (terminated | truncated)
             log.after(rewards, info, flying, ended)
             flying &= ~ended
-            if ended.any() and flying.any():
+            if (terminated | truncated).any() and flying.any():
                 # The bats that have ended fly on uncounted, so that the others keep their places in the batch.
                 observation, _ = env.reset(options={"reset_mask": terminated | truncated})
         return log.records(), log.flights

@@ -7,10 +7,11 @@ import logging
 import os
 import shutil
 import signal
+import socket
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Literal
@@ -27,7 +28,7 @@ from apex_bat.roles.plan import Addresses, Role, roles_of
 from apex_bat.roles.process import ADDRESSES
 from apex_bat.storage import StorageError, write_text
 from apex_bat.transport.reports import ReportCollector
-from apex_bat.transport.sockets import free_ports
+from apex_bat.transport.security import load_keys
 
 STATUS = "status.json"
 STATUS_PERIOD_S = 1.0
@@ -41,7 +42,8 @@ def train(config: Config, run: Path, view: View) -> tuple[Outcome, str]:
     """Trains in a run folder made by `runs.create` and returns how it ended and, if it failed, why in one line."""
     with _terminable(), _addresses(config, run) as addresses:
         write_text(run / ADDRESSES, msgspec.json.encode(addresses).decode())
-        collector = ReportCollector(addresses.reports)
+        keys = load_keys(Path(config.transport.keys)) if config.transport.keys else None
+        collector = ReportCollector(addresses.reports, keys=keys)
         launch = _Launch(config, run, collector)
         try:
             with view:
@@ -152,7 +154,8 @@ def _addresses(config: Config, run: Path) -> Iterator[Addresses]:
         TransportError: no port could be had.
     """
     if config.transport.host != "ipc":
-        host, ports = config.transport.host, free_ports(config.transport.host, 3, config.transport.base_port)
+        host, base_port = config.transport.host, config.transport.base_port
+        ports = [base_port + i for i in range(3)] if base_port else _free_ports(host, 3)
         yield Addresses(*(f"tcp://{host}:{port}" for port in ports))
         return
     folder = run.resolve() / "sockets"
@@ -164,3 +167,12 @@ def _addresses(config: Config, run: Path) -> Iterator[Addresses]:
         yield Addresses(*(f"ipc://{folder / name}" for name in ("replay", "weights", "reports")))
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _free_ports(host: str, number: int) -> list[int]:
+    """Returns ports that are free now; another process could take one before the roles bind them."""
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(number)]
+        for each in sockets:
+            each.bind((host, 0))
+        return [each.getsockname()[1] for each in sockets]

@@ -59,9 +59,11 @@ class Actor:
         ]
         self._policy = Policy(config.network, config.state_steps)
         self._learner_step = -1
-        self._weights = WeightsSubscriber(assignment.addresses.weights, self._policy.shapes)
-        actor = f"{role.name}.{assignment.incarnation}"
-        self._writer = ReplayWriter(assignment.addresses.replay, actor, config.actor.window_chunks)
+        keys, most = assignment.keys(), config.transport.max_message_bytes
+        self._weights = WeightsSubscriber(
+            assignment.addresses.weights, self._policy.shapes, keys=keys, max_message_bytes=most
+        )
+        self._writer = ReplayWriter(assignment.addresses.replay, role.name, config.actor.window_chunks, keys=keys)
         self._reporter = RoleReporter(assignment)
         self._phases = Phases("simulation", "policy", "gathering")
         self._num_steps = 0
@@ -79,7 +81,7 @@ class Actor:
         if not self._writer.has_room:
             self._writer.poll(timeout_s)
             if not self._writer.has_room:
-                return self._wait("waiting for the replay server to accept chunks")
+                return self._wait(f"waiting for the replay server: {self._writer.waiting or 'no answer'}")
         if self._observation is None:
             self._begin()
         return True
@@ -161,13 +163,16 @@ class Actor:
                 self._reporter.average("return_greedy", float(self._returns[bat]))
         self._returns[ended] = 0.0
         observation, _ = self._env.reset(options={"reset_mask": ended})
-        fresh = self._policy(States(*(array[ended] for array in _states(observation))))
-        for values, new in zip(self._values, fresh, strict=True):
-            values[ended] = new
+        states = _states(observation)
+        fresh = self._policy(States(states.echoes[ended], states.actions[ended]))
+        for values, first in zip(self._values, fresh, strict=True):
+            values[ended] = first
         self._observation, self._frames = observation, self._env.newest_frames.copy()
 
     def _take_up_weights(self, timeout_s: float) -> bool:
-        weights = self._weights.newest(timeout_s)
+        if timeout_s > 0.0:
+            self._weights.wait(timeout_s)
+        weights = self._weights.newest()
         if weights is None:
             return False
         self._policy.load(weights.arrays)
@@ -182,7 +187,7 @@ class Actor:
 
     def _report(self, state: str) -> None:
         self._reporter.gauge("learner_step", self._learner_step)
-        for name, value in self._writer.metrics().items():
+        for name, value in self._writer.counters().items():
             self._reporter.gauge(name, value)
         self._reporter.send(state, self._phases)
 

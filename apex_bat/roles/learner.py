@@ -51,8 +51,12 @@ class Learner:
         self._agent = D3QN(config, device_of(config.device))
         self._version = 0
         self._restore(checkpoint.load_newest(self._folder))
-        self._publisher = WeightsPublisher(assignment.addresses.weights)
-        self._reader = ReplayReader(assignment.addresses.replay, config.learner.batch_size, config.learner.prefetch)
+        keys = assignment.keys()
+        self._publisher = WeightsPublisher(assignment.addresses.weights, keys=keys)
+        self._reader = ReplayReader(
+            assignment.addresses.replay, config.learner.batch_size, config.learner.prefetch,
+            learner_step=self._agent.num_updates, keys=keys, max_message_bytes=config.transport.max_message_bytes,
+        )  # fmt: skip
         self._reporter = RoleReporter(assignment, assignment.addresses.weights)
         self._phases = Phases("waiting", "update", "weights", "checkpoint")
         self._checkpoint_due_s = time.monotonic() + config.checkpoint.period_s
@@ -72,7 +76,7 @@ class Learner:
         if batch is not None:
             with self._phases.of("update"):
                 update = self._agent.update(batch)
-            self._reader.update(batch.items, np.abs(update.errors), self._agent.num_updates)
+            self._reader.update(batch.items, np.abs(update.errors))
             self._reporter.count("updates", 1)
             self._reporter.average("loss", update.loss)
             self._reporter.average("gradient_norm", update.gradient_norm)
@@ -84,6 +88,8 @@ class Learner:
         if self._reporter.is_due:
             self._reporter.gauge("learner_step", self._agent.num_updates)
             self._reporter.gauge("weights_version", self._version)
+            for name, value in self._reader.counters().items():
+                self._reporter.gauge(name, value)
             self._reporter.send("learning" if batch is not None else self._reader.waiting, self._phases)
         return batch is not None
 

@@ -12,6 +12,7 @@ import numpy as np
 from msgspec import Struct
 
 from apex_bat.config import Config
+from apex_bat.transport.security import Keys, load_keys
 
 Kind = Literal["replay", "learner", "actor", "evaluator"]
 
@@ -56,6 +57,15 @@ class Assignment(NamedTuple):
         """Returns the role's own random stream, derived from the run's seed, its kind, number and incarnation."""
         kind = ("replay", "learner", "actor", "evaluator").index(self.role.kind)
         return np.random.default_rng([self.config.seed, kind, self.role.number, self.incarnation])
+
+    def keys(self) -> Keys | None:
+        """Returns the CURVE keys that the settings name; None without.
+
+        Raises:
+            TransportError: they are missing or others may read them.
+        """
+        folder = self.config.transport.keys
+        return load_keys(Path(folder)) if folder else None
 
     @property
     def host(self) -> str:

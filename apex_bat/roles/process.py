@@ -6,7 +6,6 @@ import faulthandler
 import logging
 import os
 import signal
-import sys
 import threading
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import msgspec
 from apex_bat.config import ConfigError, load
 from apex_bat.roles.plan import Addresses, Assignment, Kind, Role
 from apex_bat.storage import StorageError
-from apex_bat.transport.sockets import TransportError
+from apex_bat.transport.security import TransportError
 
 ADDRESSES = "addresses.json"
 FAILED, USELESS = 1, 2
@@ -74,7 +73,7 @@ def _run(assignment: Assignment) -> None:
 
 def _hold_leash(stop: threading.Event, grace_s: float) -> None:
     """Waits for the end of standard input, then gives the role its grace and ends it by force."""
-    while sys.stdin.buffer.read(4096):
+    while os.read(0, 4096):  # not sys.stdin: its lock, held here, would abort the interpreter's end
         pass
     stop.set()
     timer = threading.Timer(grace_s, os._exit, (FAILED,))

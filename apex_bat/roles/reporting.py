@@ -47,7 +47,7 @@ class RoleReporter:
         """`address` is where the role listens, if it does."""
         self._role = assignment.role.name
         self._pid, self._host, self._address = assignment.pid, assignment.host, address
-        self._reporter = Reporter(assignment.addresses.reports)
+        self._reporter = Reporter(assignment.addresses.reports, keys=assignment.keys())
         self._totals: defaultdict[str, float] = defaultdict(float)
         self._gauges: dict[str, float] = {}
         self._sums: dict[str, tuple[float, int]] = {}

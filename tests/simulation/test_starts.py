@@ -1,0 +1,65 @@
+"""Safe starts: clear, with a way out, and spread over the whole drivable region."""
+
+import numpy as np
+import pytest
+
+from apex_bat.config.settings import Body, Episode
+from apex_bat.simulation.arenas import load_arena
+from apex_bat.simulation.ground import ground_plan
+from apex_bat.simulation.motion import TURN_SIGN, fly_arc, step_length_m, step_turn_rad
+from apex_bat.simulation.starts import StartRegion, start_region
+
+BODY, EPISODE = Body(), Episode()
+
+
+def region(name: str) -> StartRegion:
+    return start_region(load_arena(name), BODY, EPISODE)
+
+
+@pytest.mark.parametrize("name", ["simple", "narrow", "maze"])
+def test_from_every_start_one_action_held_for_ten_steps_touches_nothing(name: str) -> None:
+    ground, generator = ground_plan([load_arena(name)]), np.random.default_rng(1)
+    starts = np.array([region(name).sample(generator) for _ in range(60)])
+    arena = np.zeros(60, np.int64)
+    assert ground.clearance_m(starts[:, :2], arena).min() > EPISODE.safe_start_m
+    survives = np.zeros(60, bool)
+    for sign in TURN_SIGN:
+        poses, clear = starts, np.ones(60, bool)
+        for _ in range(10):
+            poses = fly_arc(poses, np.full(60, sign * step_turn_rad(BODY)), np.full(60, step_length_m(BODY)))
+            clear &= ground.clearance_m(poses[:, :2], arena) > BODY.diameter_m / 2
+        survives |= clear
+    assert survives.all()
+
+
+def test_facing_a_wall_from_half_a_metre_is_not_safe_and_facing_away_is() -> None:
+    wall_m = 4.525  # inner face of the eastern wall of simple
+    poses = np.array([[wall_m - 0.5, 0.0, 0.0], [wall_m - 0.5, 0.0, np.pi / 2]])
+    np.testing.assert_array_equal(region("simple").is_safe(poses), [False, True])
+
+
+def test_starts_reach_every_part_of_the_corridor_and_every_heading() -> None:
+    generator = np.random.default_rng(2)
+    starts = np.array([region("simple").sample(generator) for _ in range(400)])
+    legs = [starts[:, 0] > 3.1, starts[:, 1] > 2.8, starts[:, 0] < -3.1, starts[:, 1] < -3.2]
+    assert all(leg.sum() > 20 for leg in legs)
+    assert np.histogram(starts[:, 2], bins=8, range=(-np.pi, np.pi))[0].min() > 15
+
+
+def test_starts_are_connected_to_the_arenas_start() -> None:
+    cells = region("simple").cells
+    is_inside_island = (cells[:, 0] > 0.9) & (cells[:, 0] < 2.9) & (cells[:, 1] > -2.9) & (cells[:, 1] < 2.6)
+    assert not is_inside_island.any()
+
+
+def test_equal_generators_draw_equal_starts() -> None:
+    first, second = (region("circle").sample(np.random.default_rng(7)) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_clearance_of_starts_is_a_setting() -> None:
+    wide = start_region(load_arena("simple"), BODY, Episode(safe_start_m=0.6))
+    generator = np.random.default_rng(3)
+    starts = np.array([wide.sample(generator) for _ in range(30)])
+    ground = ground_plan([load_arena("simple")])
+    assert ground.clearance_m(starts[:, :2], np.zeros(30, np.int64)).min() > 0.6

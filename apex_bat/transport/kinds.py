@@ -1,0 +1,146 @@
+"""The kinds of messages: what each holds, and the header that carries it.
+
+A message without arrays is its own header. One with arrays is a named tuple; its header tells their sizes. Limits on
+numbers, texts and lists stand in the types and are checked when a header is decoded.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from apex_bat.experience import Batch, Chunk
+
+MAX_ROWS = 65_535  # of a chunk: transitions name their rows in uint16
+
+Name = Annotated[str, Meta(min_length=1, max_length=200)]
+Text = Annotated[str, Meta(max_length=1000)]
+Number = Annotated[int, Meta(ge=0, le=2**62)]
+Rows = Annotated[int, Meta(ge=1, le=MAX_ROWS)]
+Length = Annotated[int, Meta(ge=1, le=2**31)]
+PerChunk = Meta(min_length=1, max_length=4096)
+
+
+class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"):
+    """What all headers share: a field `kind` that names the message."""
+
+
+class InsertHeader(Header, frozen=True, tag="insert"):
+    """Header of an `Insert`; the lists have one entry a chunk."""
+
+    actor: Name
+    incarnation: Number
+    sequence: Number
+    first_unacknowledged: Number
+    learner_step: Number
+    first_steps: Annotated[tuple[Number, ...], PerChunk]
+    rows: Annotated[tuple[Rows, ...], PerChunk]
+    transitions: Annotated[tuple[Rows, ...], PerChunk]
+
+
+class Insert(NamedTuple):
+    """Experience of an actor."""
+
+    actor: str
+    incarnation: int
+    """Random number of this life of the actor; a restarted actor has another."""
+    sequence: int
+    """1, 2, ... within the incarnation. The server stores each number once, in order."""
+    first_unacknowledged: int
+    """Least sequence for which the actor still holds the data: none below it will come again."""
+    learner_step: int
+    """Updates that the weights which flew these chunks had seen."""
+    chunks: tuple[Chunk, ...]
+
+
+class Ack(Header, frozen=True, tag="ack"):
+    """The server has stored an insert for good, or refused it for good."""
+
+    incarnation: Number
+    sequence: Number
+    refused: Text = ""
+    """Why it was refused; empty when it was stored."""
+    superseded: bool = False
+    """Another incarnation of this actor has taken its place: it must end."""
+
+
+class Waiting(Header, frozen=True, tag="waiting"):
+    """The server is alive and holds what was sent; for whom it waits."""
+
+    reason: Text
+
+
+class SampleRequest(Header, frozen=True, tag="request"):
+    """Asks for one batch."""
+
+    request: Number
+    """Number that the answer repeats; a request sent twice is answered once while it is queued."""
+    batch_size: Annotated[int, Meta(ge=1, le=65_536)]
+    learner_step: Number
+
+
+class SampleHeader(Header, frozen=True, tag="sample"):
+    """Header of a `Sample`."""
+
+    request: Number
+    size: Annotated[int, Meta(ge=1, le=65_536)]
+    memory_steps: Annotated[int, Meta(ge=1, le=255)]
+
+
+class Sample(NamedTuple):
+    """A batch and the number of the request that it answers."""
+
+    request: int
+    batch: Batch
+
+
+class PriorityHeader(Header, frozen=True, tag="priorities"):
+    """Header of a `PriorityUpdate`."""
+
+    learner_step: Number
+    size: Annotated[int, Meta(ge=1, le=1 << 20)]
+
+
+class PriorityUpdate(NamedTuple):
+    """New |TD errors|: items int64 (size,), priorities float32 (size,)."""
+
+    learner_step: int
+    items: NDArray[np.int64]
+    priorities: NDArray[np.float32]
+
+
+class WeightsHeader(Header, frozen=True, tag="weights"):
+    """Header of `Weights`."""
+
+    version: Number
+    learner_step: Number
+    names: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=1024)]
+    shapes: Annotated[tuple[Annotated[tuple[Length, ...], Meta(max_length=8)], ...], Meta(max_length=1024)]
+
+
+class Weights(NamedTuple):
+    """A network: float32 arrays by name."""
+
+    version: int
+    learner_step: int
+    arrays: dict[str, NDArray[np.float32]]
+
+
+class Report(Header, frozen=True, tag="report"):
+    """A role tells the launcher that it lives, and how."""
+
+    role: Name
+    pid: Number
+    host: Text
+    address: Text
+    state: Text
+    """What it does, or for whom it waits."""
+    metrics: Annotated[dict[Name, float], Meta(max_length=1024)]
+
+
+Message = Insert | Ack | Waiting | SampleRequest | Sample | PriorityUpdate | Weights | Report
+Headers = InsertHeader | Ack | Waiting | SampleRequest | SampleHeader | PriorityHeader | WeightsHeader | Report

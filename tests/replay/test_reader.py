@@ -1,0 +1,175 @@
+"""The learner's end: what it is given, what it gives back, and what it says while it waits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from apex_bat.config.settings import Config
+from apex_bat.experience import Batch, Chunk
+from apex_bat.replay.client import ReplayReader, ReplayWriter
+from apex_bat.replay.server import ReplayServer
+
+MakeChunk = Callable[..., Chunk]
+Until = Callable[..., None]
+
+
+@pytest.fixture
+def free_running(config: Config) -> Config:
+    """Settings in which nobody waits, and priorities count as they are."""
+    replay = msgspec.structs.replace(config.replay, never_block=True, alpha=1.0, priority_epsilon=1e-6)
+    return msgspec.structs.replace(config, replay=replay)
+
+
+@pytest.fixture
+def address(tmp_path: Path) -> str:
+    tmp_path.chmod(0o700)
+    return f"ipc://{tmp_path}/r"
+
+
+@pytest.fixture
+def server(free_running: Config, address: str) -> Iterator[ReplayServer]:
+    one = ReplayServer(free_running, address, np.random.default_rng(0))
+    yield one
+    one.close()
+
+
+@pytest.fixture
+def reader(address: str) -> Iterator[ReplayReader]:
+    one = ReplayReader(address, batch_size=16, prefetch=3, ask_again_s=0.1)
+    yield one
+    one.close()
+
+
+def batches(server: ReplayServer, reader: ReplayReader, num: int) -> list[Batch]:
+    """Returns the next batches, while the server is served from here."""
+    got: list[Batch] = []
+    for _ in range(20_000):
+        server.serve(0.0)
+        if (batch := reader.next(0.001)) is not None:
+            got.append(batch)
+        if len(got) == num:
+            return got
+    raise AssertionError(f"only {len(got)} of {num} batches came; {reader.waiting}")
+
+
+def test_frequencies_follow_priorities_through_the_whole_wire(
+    server: ReplayServer, reader: ReplayReader, address: str, make_chunk: MakeChunk, until: Until
+) -> None:
+    writer = ReplayWriter(address, "a", 8)
+    chunk = make_chunk(40)
+    writer.send([chunk], 0)
+    until(lambda: not writer.unacknowledged, lambda: server.serve(0.01), lambda: writer.poll(0.0))
+    writer.close()
+    batches(server, reader, 3)
+    changed = np.linspace(0.5, 4.0, 20, dtype=np.float32)
+    reader.update(np.arange(20), changed)
+    until(lambda: server.store.learner_step == 1, lambda: server.serve(0.01))
+    batches(server, reader, 6)  # those drawn before the update
+    drawn = np.concatenate([batch.items for batch in batches(server, reader, 300)])
+    wanted = np.concatenate([changed, chunk.priorities[20:]]).astype(np.float64) + 1e-6
+    expected = wanted / wanted.sum() * len(drawn)
+    chi_square = ((np.bincount(drawn, minlength=40) - expected) ** 2 / expected).sum()
+    assert chi_square < 73  # 0.1 % of 39 degrees of freedom; stratified draws lie below a chi-square
+
+
+def test_batches_are_asked_for_ahead_and_no_further(
+    server: ReplayServer, reader: ReplayReader, make_chunk: MakeChunk, until: Until
+) -> None:
+    server.store.add("a", 0, [make_chunk(40)])
+    until(lambda: reader.counters()["reader.ready"] == 3, lambda: server.serve(0.01))
+    server.serve(0.05)
+    assert reader.counters()["reader.received"] == 3
+    assert reader.next(0.0) is not None
+    until(lambda: reader.counters()["reader.received"] == 4, lambda: server.serve(0.01))
+
+
+def test_arrays_of_a_batch_can_be_written_to_and_are_complete(
+    server: ReplayServer, reader: ReplayReader, make_chunk: MakeChunk
+) -> None:
+    server.store.add("a", 0, [make_chunk(40)])
+    batch = batches(server, reader, 1)[0]
+    assert batch.states.echoes.shape == batch.next_states.echoes.shape == (16, 6, 24)
+    assert batch.states.actions.shape == (16, 3)
+    assert batch.states.echoes.flags.writeable
+    assert (batch.states.echoes != 0).all()
+
+
+def test_each_update_counts_one_learner_step(
+    server: ReplayServer, address: str, make_chunk: MakeChunk, until: Until
+) -> None:
+    server.store.add("a", 0, [make_chunk(40)])
+    reader = ReplayReader(address, 16, 2, learner_step=100)
+    try:
+        for _ in range(3):
+            reader.update(np.array([1]), np.array([0.5], np.float32))
+        until(lambda: server.store.learner_step == 103, lambda: server.serve(0.01))
+    finally:
+        reader.close()
+
+
+def test_it_says_what_the_server_waits_for_and_when_there_is_no_server(
+    server: ReplayServer, reader: ReplayReader, until: Until
+) -> None:
+    until(lambda: "20 transitions are missing" in reader.waiting, lambda: server.serve(0.01))
+    assert reader.next(0.0) is None
+    server.close()
+    until(lambda: "no answer from the replay server at ipc" in reader.waiting, lambda: reader.next(0.01))
+
+
+def test_it_goes_on_with_the_next_server_at_the_same_address(
+    server: ReplayServer, reader: ReplayReader, free_running: Config, address: str, make_chunk: MakeChunk, until: Until
+) -> None:
+    # The first has nothing to give, and dies with all three requests in its queue.
+    until(lambda: server.metrics()["replay.queued_requests"] == 3, lambda: server.serve(0.01))
+    server.close()
+    second = ReplayServer(free_running, address, np.random.default_rng(1))
+    try:
+        second.store.add("a", 0, [make_chunk(40)])
+        batches(second, reader, 10)
+        assert reader.counters()["reader.asked_again"] >= 3
+    finally:
+        second.close()
+
+
+def test_several_servers_give_items_that_find_their_way_back(
+    free_running: Config, make_chunk: MakeChunk, until: Until
+) -> None:
+    servers = [ReplayServer(free_running, "tcp://127.0.0.1:0", np.random.default_rng(i)) for i in range(2)]
+    for server in servers:
+        server.store.add("a", 0, [make_chunk(40)])
+    reader = ReplayReader([server.address for server in servers], 16, 4)
+
+    def serve_both() -> None:
+        for server in servers:
+            server.serve(0.001)
+
+    try:
+        seen: set[int] = set()
+        for _ in range(20):
+            until(lambda: reader.counters()["reader.ready"], serve_both)
+            batch = reader.next(1.0)
+            assert batch is not None
+            assert len(set(batch.items % 2)) == 1
+            seen |= set((batch.items % 2).tolist())
+        assert seen == {0, 1}
+        reader.update(np.array([2 * 7 + 1, 2 * 5]), np.array([3.0, 2.0], np.float32))
+        until(lambda: all(server.store.learner_step for server in servers), serve_both)
+        stored = [server.store.buffer.item_arrays()["items"]["priority"] for server in servers]
+        assert stored[1][7] == pytest.approx(3.0, abs=1e-4)
+        assert stored[0][5] == pytest.approx(2.0, abs=1e-4)
+    finally:
+        reader.close()
+        for server in servers:
+            server.close()
+
+
+def test_closing_is_quick_without_a_server(address: str) -> None:
+    reader = ReplayReader(address, 16, 4)
+    reader.update(np.array([1]), np.array([1.0], np.float32))
+    reader.close()
+    reader.close()

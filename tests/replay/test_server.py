@@ -1,0 +1,248 @@
+"""The server through its socket, driven in this thread; hostile bytes come from a bare socket."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import zmq
+
+from apex_bat.config.settings import Config
+from apex_bat.experience import Chunk
+from apex_bat.replay.client import ReplayReader, ReplayWriter
+from apex_bat.replay.metrics import METRICS, READER_METRICS, WRITER_METRICS
+from apex_bat.replay.server import ReplayServer
+from apex_bat.transport.messages import (
+    Ack,
+    Insert,
+    Message,
+    PriorityUpdate,
+    Report,
+    Sample,
+    SampleRequest,
+    Waiting,
+    decode,
+    encode,
+)
+
+MakeChunk = Callable[..., Chunk]
+Until = Callable[..., None]
+
+
+class Peer:
+    """A bare client."""
+
+    def __init__(self, address: str) -> None:
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.DEALER)
+        self._socket.connect(address)
+        self.got: list[Message] = []
+
+    def send(self, *messages: Message | bytes) -> None:
+        for message in messages:
+            self._socket.send(message if isinstance(message, bytes) else encode(message))
+
+    def receive(self) -> None:
+        while self._socket.poll(0):
+            self.got.append(decode(self._socket.recv()))
+
+    def close(self) -> None:
+        self._context.destroy(linger=0)
+
+
+@pytest.fixture
+def server(config: Config, tmp_path: Path) -> Iterator[ReplayServer]:
+    one = ReplayServer(config, "tcp://127.0.0.1:0", np.random.default_rng(0), tmp_path / "replay")
+    yield one
+    one.close()
+
+
+@pytest.fixture
+def peer(server: ReplayServer) -> Iterator[Peer]:
+    one = Peer(server.address)
+    yield one
+    one.close()
+
+
+def insert(make_chunk: MakeChunk, sequence: int, actor: str = "a", transitions: int = 10) -> Insert:
+    return Insert(actor, 1, sequence, 1, 0, (make_chunk(transitions),))
+
+
+def test_an_insert_is_acknowledged_and_stored_once_however_often_it_comes(
+    server: ReplayServer, peer: Peer, make_chunk: MakeChunk, until: Until
+) -> None:
+    message = insert(make_chunk, 1)
+    peer.send(message, message, message)
+    until(lambda: server.metrics()["replay.duplicates"] == 2, lambda: server.serve(0.01))
+    until(lambda: peer.got, peer.receive, lambda: server.serve(0.01))
+    assert set(peer.got) == {Ack(1, 1)}
+    assert server.metrics()["replay.size"] == 10
+
+
+def test_a_held_insert_is_not_acknowledged_and_its_actor_is_told_why(
+    server: ReplayServer, peer: Peer, make_chunk: MakeChunk, until: Until
+) -> None:
+    peer.send(*(insert(make_chunk, sequence, transitions=10) for sequence in range(1, 8)))
+    until(lambda: any(isinstance(m, Waiting) for m in peer.got), lambda: server.serve(0.01), peer.receive)
+    acknowledged = [m for m in peer.got if isinstance(m, Ack)]
+    # min_size 20, band (4 x 26 + 16) / 2 = 60 samples: balance 4 x (30 - 20) = 40 lets no fourth ten in.
+    assert len(acknowledged) == 3
+    assert "actors wait for the learner" in server.state()
+    assert server.metrics()["replay.queued_inserts"] == 4
+
+
+def test_sampling_lets_held_inserts_in(server: ReplayServer, peer: Peer, make_chunk: MakeChunk, until: Until) -> None:
+    peer.send(*(insert(make_chunk, sequence) for sequence in range(1, 8)))
+    peer.send(*(SampleRequest(request, 16, 0) for request in range(20)))
+    until(lambda: sum(isinstance(m, Ack) for m in peer.got) == 7, lambda: server.serve(0.01), peer.receive)
+    assert server.metrics()["replay.samples_per_insert"] == pytest.approx(4.0, abs=60 / 50)
+
+
+def test_a_request_waits_for_the_first_transitions_and_is_answered_once(
+    server: ReplayServer, peer: Peer, make_chunk: MakeChunk, until: Until
+) -> None:
+    request = SampleRequest(5, 16, 0)
+    peer.send(request, request)
+    until(lambda: peer.got, lambda: server.serve(0.01), peer.receive)
+    assert isinstance(peer.got[0], Waiting)
+    assert "20 transitions are missing" in peer.got[0].reason
+    peer.send(insert(make_chunk, 1, transitions=20))
+    until(lambda: any(isinstance(m, Sample) for m in peer.got), lambda: server.serve(0.01), peer.receive)
+    server.serve(0.01)
+    peer.receive()
+    samples = [m for m in peer.got if isinstance(m, Sample)]
+    assert [sample.request for sample in samples] == [5]
+
+
+def test_a_non_finite_insert_is_refused_by_name_and_its_actor_goes_on(
+    server: ReplayServer, peer: Peer, make_chunk: MakeChunk, until: Until, caplog: pytest.LogCaptureFixture
+) -> None:
+    bad = insert(make_chunk, 1, "mad actor")
+    bad.chunks[0].rewards[3] = np.nan
+    peer.send(bad, insert(make_chunk, 2, "mad actor"))
+    until(lambda: len(peer.got) == 2, lambda: server.serve(0.01), peer.receive)
+    refused, stored = peer.got
+    assert isinstance(refused, Ack)
+    assert "finite" in refused.refused
+    assert stored == Ack(1, 2)
+    assert server.refusals == {"value": 1}
+    assert server.metrics()["replay.refused"] == 10
+    assert "mad actor" in caplog.text
+
+
+def test_bad_bytes_are_counted_by_reason_and_disturb_nobody(
+    server: ReplayServer, peer: Peer, make_chunk: MakeChunk, until: Until
+) -> None:
+    good = bytes(encode(insert(make_chunk, 1)))
+    wrong_version = good[:4] + b"\x09\x00" + good[6:]
+    peer.send(
+        b"", b"\x80\x04pickle", good[:-8], good + bytes(8), wrong_version, bytes(encode(insert(make_chunk, 1), 7))
+    )
+    peer.send(Report("actor", 1, "h", "a", "s", {}))
+    peer.send(good)
+    until(lambda: peer.got, lambda: server.serve(0.01), peer.receive)
+    assert peer.got == [Ack(1, 1)]
+    assert server.refusals == {"size": 4, "protocol": 1, "generation": 1, "unexpected": 1}
+
+
+def test_a_message_beyond_the_limit_is_dropped_by_the_socket(
+    config: Config, make_chunk: MakeChunk, until: Until
+) -> None:
+    small = msgspec.structs.replace(config, transport=msgspec.structs.replace(config.transport, max_message_mb=0.01))
+    server = ReplayServer(small, "tcp://127.0.0.1:0", np.random.default_rng(0))
+    large, good = Peer(server.address), Peer(server.address)
+    try:
+        large.send(insert(make_chunk, 1, "large", transitions=100))
+        good.send(insert(make_chunk, 1))
+        until(lambda: good.got, lambda: server.serve(0.01), good.receive)
+        assert set(server.store.actor_shares()) == {"a"}
+    finally:
+        large.close()
+        good.close()
+        server.close()
+
+
+def test_late_and_repeated_priorities_are_harmless(
+    server: ReplayServer, peer: Peer, make_chunk: MakeChunk, until: Until
+) -> None:
+    peer.send(insert(make_chunk, 1))
+    until(lambda: peer.got, lambda: server.serve(0.01), peer.receive)
+    late = PriorityUpdate(4, np.array([3, 999]), np.array([1.0, 1.0], np.float32))
+    peer.send(late, late)
+    until(lambda: server.metrics()["replay.late_priorities"] == 2, lambda: server.serve(0.01))
+    assert server.store.learner_step == 4
+
+
+def test_answers_to_the_gone_are_counted_and_not_as_samples(
+    server: ReplayServer, peer: Peer, make_chunk: MakeChunk, until: Until
+) -> None:
+    gone = Peer(server.address)
+    gone.send(SampleRequest(1, 16, 0))
+    until(lambda: server.metrics()["replay.queued_requests"], lambda: server.serve(0.01))
+    gone.close()
+    peer.send(insert(make_chunk, 1), insert(make_chunk, 2))
+    until(lambda: server.metrics()["replay.undelivered"], lambda: server.serve(0.01))
+    assert server.metrics()["replay.sampled"] == 0
+
+
+def test_a_restored_server_recognises_what_was_stored_and_draws_on(
+    server: ReplayServer, peer: Peer, config: Config, make_chunk: MakeChunk, until: Until, tmp_path: Path
+) -> None:
+    messages = [insert(make_chunk, 1), insert(make_chunk, 2)]
+    peer.send(*messages, SampleRequest(1, 16, 9))
+    until(lambda: len(peer.got) == 3, lambda: server.serve(0.01), peer.receive)
+    server.save()
+    restored = ReplayServer(config, "tcp://127.0.0.1:0", np.random.default_rng(99), tmp_path / "replay")
+    other = Peer(restored.address)
+    try:
+        assert "20 transitions" in restored.restore()
+        ours = {name: figure for name, figure in restored.metrics().items() if not name.endswith("_s")}
+        assert ours == {name: figure for name, figure in server.metrics().items() if not name.endswith("_s")}
+        other.send(*messages)
+        until(lambda: len(other.got) == 2, lambda: restored.serve(0.01), other.receive)
+        assert restored.metrics()["replay.size"] == 20
+        np.testing.assert_equal(server.store.sample(16, 9), restored.store.sample(16, 9))
+    finally:
+        other.close()
+        restored.close()
+
+
+def test_snapshots_are_made_while_serving_and_a_failed_one_is_told(
+    config: Config, tmp_path: Path, until: Until
+) -> None:
+    now = [0.0]
+    often = msgspec.structs.replace(config, replay=msgspec.structs.replace(config.replay, snapshot_period_s=60.0))
+    folder = tmp_path / "snapshots"
+    folder.mkdir()
+    server = ReplayServer(often, "tcp://127.0.0.1:0", np.random.default_rng(0), folder / "replay", clock=lambda: now[0])
+    try:
+        server.serve(0.0)
+        assert not list(folder.iterdir())
+        now[0] = 61.0
+        until(lambda: server.metrics()["replay.snapshots"] == 1, lambda: server.serve(0.01))
+        assert (folder / "replay").exists()
+        (folder / "replay").unlink()
+        folder.rmdir()
+        now[0] = 122.0
+        until(lambda: server.metrics()["replay.failed_snapshots"] == 1, lambda: server.serve(0.01))
+    finally:
+        server.close()
+
+
+def test_a_changed_ratio_holds_at_once(server: ReplayServer) -> None:
+    server.change_ratio(2.0)
+    assert server.store.limiter.samples_per_insert == 2.0
+
+
+def test_each_metric_is_declared(server: ReplayServer) -> None:
+    assert set(server.metrics()) == set(METRICS)
+    writer, reader = ReplayWriter(server.address, "a", 8), ReplayReader(server.address, 16, 2)
+    try:
+        assert set(writer.counters()) == set(WRITER_METRICS)
+        assert set(reader.counters()) == set(READER_METRICS)
+    finally:
+        writer.close()
+        reader.close()

@@ -1,0 +1,158 @@
+"""Snapshots: what comes back is what was there, whatever happened meanwhile or to the file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from apex_bat.experience import Chunk
+from apex_bat.replay import snapshot
+from apex_bat.replay.buffer import ReplayBuffer
+from apex_bat.replay.snapshot import SnapshotError, SnapshotWriter, previous_of, read_snapshot
+
+MakeChunk = Callable[..., Chunk]
+
+
+def new_buffer(capacity: int = 200) -> ReplayBuffer:
+    return ReplayBuffer(capacity, 300, memory_steps=3, heard_steps=3, alpha=0.6)
+
+
+def add(buffer: ReplayBuffer, chunk: Chunk) -> None:
+    buffer.add([chunk], chunk.priorities + np.float32(0.01), 2, 5)
+
+
+def state_of(buffer: ReplayBuffer, **beside: object) -> Callable[[], dict[str, Any]]:
+    return lambda: {"buffer": list(buffer.counters), "alpha": buffer.alpha} | beside
+
+
+def save(buffer: ReplayBuffer, path: Path, **beside: object) -> None:
+    assert SnapshotWriter(buffer, path).advance(state_of(buffer, **beside), wait=True)
+
+
+def assert_equal(one: ReplayBuffer, other: ReplayBuffer) -> None:
+    assert one.counters == other.counters
+    drawn = [b.sample(256, 0.4, np.random.default_rng(1)) for b in (one, other)]
+    for field, (left, right) in zip(
+        drawn[0].batch._fields, zip(drawn[0].batch, drawn[1].batch, strict=True), strict=True
+    ):
+        np.testing.assert_equal(left, right, err_msg=field)
+    np.testing.assert_array_equal(drawn[0].learner_steps, drawn[1].learner_steps)
+
+
+@pytest.fixture(autouse=True)
+def small_slices(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(snapshot, "SLICE_ROWS", 64)
+
+
+@pytest.mark.parametrize("chunks", [1, 12, 60])
+def test_a_restored_buffer_draws_the_same_batches(tmp_path: Path, make_chunk: MakeChunk, chunks: int) -> None:
+    buffer, restored = new_buffer(), new_buffer()
+    for _ in range(chunks):
+        add(buffer, make_chunk(10))
+    save(buffer, tmp_path / "replay", note="kept")
+    state, used = read_snapshot(tmp_path / "replay", restored)
+    assert state["note"] == "kept"
+    assert used == tmp_path / "replay"
+    assert_equal(buffer, restored)
+    add(buffer, chunk := make_chunk(10))
+    add(restored, chunk)
+    assert_equal(buffer, restored)
+
+
+@pytest.mark.parametrize("before", [1, 10, 60])
+@pytest.mark.parametrize("during", [1, 10, 60])
+def test_what_is_added_while_the_thread_writes_is_whole_in_the_file(
+    tmp_path: Path, make_chunk: MakeChunk, before: int, during: int
+) -> None:
+    buffer, restored = new_buffer(), new_buffer()
+    for _ in range(before):
+        add(buffer, make_chunk(10))
+    writer = SnapshotWriter(buffer, tmp_path / "replay")
+    for _ in range(during):
+        add(buffer, make_chunk(10))
+    buffer.update(np.array([buffer.counters.next_item - 1]), np.array([9.0], np.float32))
+    assert writer.advance(state_of(buffer), wait=True)
+    read_snapshot(tmp_path / "replay", restored)
+    assert_equal(buffer, restored)
+
+
+def test_the_one_before_is_used_when_the_newest_is_damaged(tmp_path: Path, make_chunk: MakeChunk) -> None:
+    buffer, restored = new_buffer(), new_buffer()
+    path = tmp_path / "replay"
+    add(buffer, make_chunk(10))
+    save(buffer, path)
+    add(buffer, make_chunk(10))
+    save(buffer, path)
+    path.write_bytes(path.read_bytes()[:-100])
+    assert read_snapshot(path, restored)[1] == previous_of(path)
+    assert len(restored) == 10
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(data=st.data())
+def test_a_damaged_file_is_refused_wherever_the_damage_is(
+    tmp_path: Path, make_chunk: MakeChunk, data: st.DataObject
+) -> None:
+    path = tmp_path / "replay"
+    if not path.exists():
+        buffer = new_buffer()
+        add(buffer, make_chunk(10))
+        save(buffer, path)
+    whole = path.read_bytes()
+    place = data.draw(st.integers(0, len(whole) - 1))
+    torn = whole[:place] if data.draw(st.booleans()) else bytearray(whole)
+    if isinstance(torn, bytearray):
+        torn[place] ^= data.draw(st.integers(1, 255))
+    damaged = tmp_path / "damaged"
+    damaged.write_bytes(torn)
+    restored = new_buffer()
+    with pytest.raises(SnapshotError):
+        read_snapshot(damaged, restored)
+    assert len(restored) == 0
+
+
+def test_a_full_disk_costs_the_new_one_and_never_the_old(
+    tmp_path: Path, make_chunk: MakeChunk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    buffer, restored = new_buffer(), new_buffer()
+    path = tmp_path / "replay"
+    add(buffer, make_chunk(10))
+    save(buffer, path)
+    before = path.read_bytes()
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        save(buffer, path)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["replay"]
+    read_snapshot(path, restored)
+
+
+def test_a_snapshot_of_other_settings_is_refused_by_name(tmp_path: Path, make_chunk: MakeChunk) -> None:
+    buffer = new_buffer()
+    add(buffer, make_chunk(10))
+    save(buffer, tmp_path / "replay")
+    with pytest.raises(SnapshotError, match="capacity 200, the settings now give 100"):
+        read_snapshot(tmp_path / "replay", new_buffer(100))
+
+
+def test_an_abandoned_snapshot_leaves_nothing(tmp_path: Path, make_chunk: MakeChunk) -> None:
+    buffer = new_buffer()
+    add(buffer, make_chunk(10))
+    SnapshotWriter(buffer, tmp_path / "replay").abandon()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_snapshot_is_no_restart_from_nothing_in_silence(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no snapshot"):
+        read_snapshot(tmp_path / "replay", new_buffer())

@@ -1,0 +1,62 @@
+"""Reports reach the launcher, or are dropped without a wait."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import zmq
+
+from apex_bat.transport.messages import Report
+from apex_bat.transport.reports import ReportCollector, Reporter
+from apex_bat.transport.sockets import Connection
+
+
+def report(**metrics: float) -> Report:
+    return Report("actor", 12, "host", "ipc:///x", "flying", metrics)
+
+
+def delivered(reporter: Reporter, collector: ReportCollector, one: Report) -> list[Report]:
+    ends_s = time.monotonic() + 10
+    while not reporter.send(one):
+        assert time.monotonic() < ends_s
+        collector.poll(0.01)
+    return collector.poll(5.0)
+
+
+def test_reports_arrive_without_metrics_that_are_not_finite() -> None:
+    collector = ReportCollector("tcp://127.0.0.1:0")
+    reporter = Reporter(collector.address)
+    try:
+        assert delivered(reporter, collector, report(loss=math.nan, steps=3.0)) == [report(steps=3.0)]
+        assert collector.poll(0.0) == []
+    finally:
+        reporter.close()
+        collector.close()
+
+
+def test_without_a_launcher_reports_are_dropped_and_counted() -> None:
+    collector = ReportCollector("tcp://127.0.0.1:0")
+    collector.close()
+    reporter = Reporter(collector.address)
+    try:
+        assert not any(reporter.send(report()) for _ in range(5))
+        assert reporter.dropped == 5
+    finally:
+        reporter.close()
+
+
+def test_nonsense_is_refused_and_the_next_report_arrives() -> None:
+    collector = ReportCollector("tcp://127.0.0.1:0")
+    stranger, reporter = Connection(zmq.PUSH, collector.address), Reporter(collector.address)
+    try:
+        stranger.socket.send(b"nonsense")
+        ends_s = time.monotonic() + 10
+        while not collector.refusals.total:
+            assert time.monotonic() < ends_s
+            assert collector.poll(0.01) == []
+        assert delivered(reporter, collector, report()) == [report()]
+    finally:
+        stranger.close()
+        reporter.close()
+        collector.close()

@@ -1,7 +1,7 @@
 """The metrics of a run: rows appended to one file a role, and TensorBoard events.
 
-Each row is a JSON object on a line of its own, written and flushed at once, so that a crash loses nothing. Names,
-units and meanings of all figures are declared in `DECLARED`, once; the docs list them from there.
+Each row is a JSON object on a line of its own, written and flushed at once, so that a crash loses nothing. What each
+figure is stands in `apex_bat.roles.metrics`.
 """
 
 from __future__ import annotations
@@ -9,22 +9,12 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import NamedTuple, TextIO
+from typing import TextIO
 
 from tensorboardX import SummaryWriter
 
 from apex_bat.storage import StorageError
 from apex_bat.transport.messages import Report
-
-
-class Metric(NamedTuple):
-    """What a figure means."""
-
-    unit: str
-    meaning: str
-
-
-DECLARED: dict[str, Metric] = {}
 
 
 class MetricsWriter:

@@ -1,0 +1,51 @@
+"""The picture of a flight is drawn without a display and shows what differs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from matplotlib import image
+from numpy.typing import NDArray
+
+from apex_bat.recording.flight import Flight
+from apex_bat.recording.picture import draw_flight
+from apex_bat.recording.series import RED
+from apex_bat.simulation.layout import Arena
+
+
+def test_contact_is_marked_on_the_map_and_only_then(fly: Callable[..., Flight], room: Arena, tmp_path: Path) -> None:
+    flight = fly(20)
+    crashed = _red_on_the_map(_draw(flight, room, tmp_path / "a.png"))
+    flight.contact[:] = False
+    assert _red_on_the_map(_draw(flight, room, tmp_path / "b.png")) == 0
+    assert crashed > 50
+
+
+def test_picture_until_a_step_does_not_show_the_contact_after_it(
+    fly: Callable[..., Flight], room: Arena, tmp_path: Path
+) -> None:
+    assert _red_on_the_map(_draw(fly(20), room, tmp_path / "a.png", until_step=10)) == 0
+
+
+def test_one_step_is_enough_for_a_picture(fly: Callable[..., Flight], room: Arena, tmp_path: Path) -> None:
+    assert _draw(fly(1), room, tmp_path / "a.png").ndim == 3
+
+
+def test_picture_for_print_has_the_format_of_its_suffix(
+    fly: Callable[..., Flight], room: Arena, tmp_path: Path
+) -> None:
+    draw_flight(fly(5), room, tmp_path / "a.svg")
+    assert b"<svg" in (tmp_path / "a.svg").read_bytes()[:1000]
+
+
+def _draw(flight: Flight, arena: Arena, path: Path, until_step: int | None = None) -> NDArray[np.float32]:
+    draw_flight(flight, arena, path, until_step=until_step)
+    return np.asarray(image.imread(path), np.float32)
+
+
+def _red_on_the_map(picture: NDArray[np.float32]) -> int:
+    """Pixels in the left third that have exactly the colour of marks of contact."""
+    left = picture[:, : picture.shape[1] // 3, :3]
+    return int((np.abs(left - np.array(RED) / 255) < 0.01).all(axis=-1).sum())

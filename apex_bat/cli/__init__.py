@@ -63,7 +63,7 @@ def _report(error: Exception) -> int:
     if isinstance(error, typer.Abort):
         return 130
     if isinstance(error, _USAGE_ERROR):
-        error.show()
+        error.show()  # type: ignore[attr-defined]
         return 2
     if isinstance(error, ConfigError):
         return _line(error, 2)

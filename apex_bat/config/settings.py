@@ -7,7 +7,7 @@ object is made. Derived numbers are properties, so that each number has one home
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta, Struct
 
@@ -65,6 +65,9 @@ class Rays(Section, frozen=True):
 class Sonar(Section, frozen=True):
     """The call, the air, the reflectors and the ears (thesis section 3.1, eq. 3.1.1)."""
 
+    sample_rate_hz: ClassVar[int] = 125_000
+    """Sample rate of the thesis's chain; the frame's 24 ms are 3000 samples of it. Not a setting."""
+
     rendering: Literal["thesis", "exact"] = "thesis"
     """`thesis`: 125 kHz chain with rounded delays. `exact`: complex baseband with exact delays, cheaper."""
     call_level_db: float = 100.0
@@ -74,7 +77,7 @@ class Sonar(Section, frozen=True):
     call_ramp_samples: CountOrZero = 31
     """Length of the raised-cosine ramps at both ends, in samples of 125 kHz."""
     frequency_hz: Annotated[float, Meta(ge=20_000.0, le=60_000.0)] = 40_000.0
-    """Carrier, or the centre of the sweep (thesis)."""
+    """Carrier or centre of the sweep, and the cochlea's channel that the frame comes from (thesis)."""
     sweep_hz: float = 0.0
     """Linear FM: the carrier runs over this band, from high to low when negative. 0 is the thesis's tone."""
     absorption_db_m: NonNegative | None = 1.318
@@ -92,7 +95,8 @@ class Sonar(Section, frozen=True):
     level_jitter_db: NonNegative = 0.0
     """Standard deviation of a random level added to each reflector at each call. 0 in the thesis."""
     receiver_noise_db: float | None = None
-    """Level of white noise at each ear, dB SPL within the cochlea's 40 kHz channel. None: no noise (thesis)."""
+    """White noise at each ear, as loud within the cochlea's channel as a tone of this level, dB SPL. None: no noise
+    (thesis)."""
     directivity: Literal["phyllostomus", "piston", "table", "omni"] = "phyllostomus"
     """Mouth and ears together: the fit to Phyllostomus discolor at 40 kHz, a circular piston,
     a user's table, or the same level from everywhere."""
@@ -113,6 +117,17 @@ class Sonar(Section, frozen=True):
             raise ValueError("temperature_c and humidity_percent do nothing unless absorption_db_m is None")
         if (self.directivity == "table") != bool(self.directivity_table):
             raise ValueError('directivity_table and directivity = "table" belong together')
+        if 2 * self.call_ramp_samples > self.call_duration_s * self.sample_rate_hz:
+            raise ValueError(
+                f"two ramps of {self.call_ramp_samples} samples are longer than a call of {self.call_duration_s} s"
+            )
+        if abs(self.sweep_hz) >= 2.0 * self.frequency_hz:
+            raise ValueError(f"a sweep of {self.sweep_hz} Hz about {self.frequency_hz} Hz passes through zero")
+
+    @property
+    def is_random(self) -> bool:
+        """Whether equal calls sound different: then each bat needs a random generator."""
+        return self.level_jitter_db > 0.0 or self.summation == "random_phase" or self.receiver_noise_db is not None
 
 
 class Sensing(Section, frozen=True):
@@ -286,6 +301,11 @@ class Transport(Section, frozen=True):
     """Folder of CURVE keys made by `apex-bat keys`."""
     max_message_mb: Annotated[float, Meta(gt=0.0, le=1024.0)] = 64.0
     """A larger message is refused."""
+
+    @property
+    def max_message_bytes(self) -> int:
+        """`max_message_mb` in bytes (of 2^20 a MB)."""
+        return int(self.max_message_mb * 2**20)
 
 
 class Train(Section, frozen=True):

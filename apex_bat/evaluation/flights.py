@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -110,7 +111,7 @@ class _Log:
         self._rewards = np.zeros(n)
         self._actions = np.zeros((n, NUM_ACTIONS), np.int64)
         self._clearance: list[list[float]] = [[] for _ in range(n)]
-        self._last: list[dict[str, object]] = [{} for _ in range(n)]
+        self._last: list[dict[str, Any]] = [{} for _ in range(n)]
         self._chosen = np.zeros(n, np.int64)
         self._logs = [
             FlightLog(
@@ -120,10 +121,11 @@ class _Log:
             )
             for i in range(min(num_recorded, n))
         ]  # fmt: skip
-        self._before: list[dict[str, object]] = []
+        self._before: list[dict[str, Any]] = []
         self.flights: list[Flight] = []
 
     def begin(self) -> None:
+        """Notes where the bats start."""
         self._starts = self._env.poses.copy()
 
     def before(
@@ -163,8 +165,9 @@ class _Log:
             if i < len(self._logs):
                 self._logs[i].append(
                     **next(recorded), reward=float(rewards[i]), contact=bool(info["contact"][i]),
-                    **{name: float(info[name][i]) for name in (
-                        "reward_straight", "reward_near", "clearance_m", "progress_m", "distance_m")},
+                    reward_straight=float(info["reward_straight"][i]), reward_near=float(info["reward_near"][i]),
+                    clearance_m=float(info["clearance_m"][i]), progress_m=float(info["progress_m"][i]),
+                    distance_m=float(info["distance_m"][i]),
                 )  # fmt: skip
             if ended[i]:
                 self._last[i] = {name: values[i] for name, values in info.items()}

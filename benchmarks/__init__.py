@@ -1,0 +1,1 @@
+"""Benchmarks of the parts: each module measures one and returns records of figures."""

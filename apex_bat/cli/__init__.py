@@ -67,7 +67,13 @@ def _report(error: Exception) -> int:
         return 2
     if isinstance(error, ConfigError):
         return _line(error, 2)
-    known = {"ArenaError": 2, "TransportError": 1, "RunError": 1}  # by name: their modules need not be installed
+    known = {
+        "ArenaError": 2,
+        "TransportError": 1,
+        "RunError": 1,
+        "RecordingError": 1,
+        "SnapshotError": 1,
+    }  # by name: their modules need not be installed
     if isinstance(error, StorageError):
         return _line(error, 1)
     for kind in type(error).__mro__:

@@ -60,8 +60,8 @@ def tensor_columns(archetype: Literal["BarChart", "Tensor"], values: NDArray[np.
     return [rr.ComponentColumn(descriptor, _TensorBatch(values))]
 
 
-def image_columns(values: NDArray[np.float32]) -> Iterable[rr.ComponentColumn]:
-    """Returns the column of one image a row; `values` is float32 (rows, height, width), the top line first.
+def image_columns(values: NDArray[np.floating]) -> Iterable[rr.ComponentColumn]:
+    """Returns the column of one image a row; `values` is float16 or float32 (rows, height, width), top line first.
 
     Images of numbers are rerun's DepthImage, the only one that the viewer draws through a colour map with a fixed
     range; nothing about them is a depth.

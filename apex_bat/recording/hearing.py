@@ -6,7 +6,7 @@ The echo frames are those that the bat heard. The stages before them are compute
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -50,7 +50,7 @@ def log_frame_styles(recording: rr.RecordingStream, state_rows: int) -> None:
     """Logs once how echo frames and states of so many rows are drawn: colours, range, axes."""
     for ear, colour in zip(EAR_NAMES, EAR_COLOURS, strict=True):
         _log_bars(recording, f"echo/{ear}/frame", colour, np.arange(0.5, NUM_BINS), 0.9)
-    _log_image(recording, "policy/state", NUM_BINS, state_rows)
+    _log_image(recording, "policy/state", NUM_BINS, state_rows, "F32")
     ages = [f"t-{age}" if age else "t" for age in range(state_rows // NUM_EARS - 1, -1, -1)]
     rows = [f"{age} {ear}" for age in ages for ear in EAR_NAMES]
     y_ticks = [(label, row + 0.5) for row, label in enumerate(rows)]
@@ -68,7 +68,7 @@ def log_stage_styles(recording: rr.RecordingStream, echo: Echo) -> None:
         if echo.pressure_pa is not None:
             times_ms = np.arange(echo.pressure_pa.shape[-1]) / echo.sample_rate_hz * 1e3
             _log_bars(recording, f"echo/{ear}/waveform", colour, times_ms, 5.0 * times_ms[1])
-        _log_image(recording, f"echo/{ear}/cochleagram", num_times, num_channels)
+        _log_image(recording, f"echo/{ear}/cochleagram", num_times, num_channels, "F16")
         log_axes(recording, f"echo/{ear}/cochleagram", (num_times, num_channels), _ms_ticks(num_times), y_ticks)
 
 
@@ -107,12 +107,12 @@ def send_points(
 
 
 def send_stages(recording: rr.RecordingStream, echo: Echo, times: list[rr.TimeColumn]) -> None:
-    """Sends the waveforms in Pa (as float16: 0.05 % of each value) and the cochleagrams of some calls."""
+    """Sends the waveforms in Pa and the cochleagrams of some calls, as float16: within 0.05 % of each value."""
     for number, ear in enumerate(EAR_NAMES):
         if echo.pressure_pa is not None:
             pressure_pa = echo.pressure_pa[:, number].astype(np.float16)
             recording.send_columns(f"echo/{ear}/waveform", times, tensor_columns("BarChart", pressure_pa))
-        upside = np.ascontiguousarray(echo.cochleagram[:, number, ::-1], np.float32)
+        upside = echo.cochleagram[:, number, ::-1].astype(np.float16)
         recording.send_columns(f"echo/{ear}/cochleagram", times, image_columns(upside))
 
 
@@ -150,9 +150,9 @@ def _ms_ticks(width: int) -> list[Tick]:
     return [(f"{ms} ms", ms * width / NUM_BINS) for ms in TICKS_MS]
 
 
-def _log_image(recording: rr.RecordingStream, path: str, width: int, height: int) -> None:
+def _log_image(recording: rr.RecordingStream, path: str, width: int, height: int, dtype: Literal["F16", "F32"]) -> None:
     image = rr.DepthImage.from_fields(
-        format=rr.components.ImageFormat(width=width, height=height, channel_datatype="F32"),
+        format=rr.components.ImageFormat(width=width, height=height, channel_datatype=dtype),
         meter=1.0,
         colormap="viridis",
         depth_range=FRAME_RANGE,

@@ -15,8 +15,8 @@ from apex_bat.simulation.arenas import load_arena
 from apex_bat.simulation.rays import ray_angles
 
 
-def keep_flights(flights: Sequence[Flight], config: Config, run: Path) -> None:
-    """Writes flights to `recordings/` and a picture of the first in each arena to `figures/`."""
+def keep_flights(flights: Sequence[Flight], config: Config, run: Path, *, draw: bool = True) -> None:
+    """Writes flights to `recordings/` and, if asked to, a picture of the first in each arena to `figures/`."""
     if not flights:
         return
     recordings = run / "recordings"
@@ -27,7 +27,7 @@ def keep_flights(flights: Sequence[Flight], config: Config, run: Path) -> None:
         arena = load_arena(flight.facts.arena)
         path = recordings / flight.facts.file_name()
         write_flight(flight, arena, config.sonar, directions, path)
-        if arena.name not in drawn:
+        if draw and arena.name not in drawn:
             drawn.add(arena.name)
             draw_flight(flight, arena, run / "figures" / f"{path.stem}.png")
     prune(recordings, config.recording.max_mb)

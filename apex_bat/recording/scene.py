@@ -85,7 +85,7 @@ def send_trail(recording: rr.RecordingStream, flight: Flight, rows: slice, times
     """Sends what the actions of some steps led to: a piece of trail each; `times` are those of the results."""
     ends = _raise(flight.poses, TRAIL_HEIGHT_M)
     pieces = np.stack([ends[:-1], ends[1:]], axis=1)[rows]
-    colours = _colours(np.where(flight.reward_near[rows] == 0, 1, 0), (GREEN, RED))
+    colours = _colours(np.where(flight.reward_near[rows] != 0, 1, 0), (GREEN, RED))
     recording.send_columns("world/trajectory", times, rr.LineStrips3D.columns(strips=list(pieces), colors=colours))
 
 

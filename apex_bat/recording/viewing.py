@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -25,21 +24,18 @@ def recordings(run: Path) -> list[Path]:
 def open_viewer(run: Path, paths: list[Path], *, web: bool) -> int:
     """Opens recordings with the run's flight blueprint, listening on loopback only; returns the viewer's exit code."""
     blueprint = run / "recordings" / "flight.rbl"
-    command = [sys.executable, "-m", "rerun", *([str(blueprint)] if blueprint.exists() else []), *map(str, paths),
+    command = [sys.executable, "-m", "rerun", *map(str, paths), *([str(blueprint)] if blueprint.exists() else []),
                "--bind", "127.0.0.1", *(["--web-viewer"] if web else ["--port", "auto"])]  # fmt: skip
-    environment = os.environ | {"RERUN_ANALYTICS": "0"}
-    return subprocess.run(command, env=environment, check=False).returncode  # noqa: S603  # our own command
+    return subprocess.run(command, check=False).returncode  # noqa: S603  # our own command
 
 
 def draw(recording: Path, picture: Path) -> None:
     """Draws a recorded flight without a viewer: top view and echo strip.
 
     Raises:
-        StorageError: the recording cannot be read.
+        RecordingError: the recording cannot be read.
     """
     from apex_bat.recording.picture import draw_flight
-    from apex_bat.recording.reading import read_flight
-    from apex_bat.simulation.arenas import load_arena
+    from apex_bat.recording.reading import read_flight, read_settings
 
-    flight = read_flight(recording)
-    draw_flight(flight, load_arena(flight.facts.arena), picture)
+    draw_flight(read_flight(recording), read_settings(recording).arena, picture)

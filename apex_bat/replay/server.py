@@ -42,7 +42,7 @@ from apex_bat.transport.sockets import Listener
 logger = logging.getLogger(__name__)
 
 RECEIVE_AT_ONCE = 64  # messages taken from the socket before those that wait are looked at
-WORK_S = 0.005  # time for those that wait before the socket is looked at again: requests must not queue behind inserts
+WORK_S = 0.003  # time each for requests and for inserts that wait, before the socket is looked at again
 MAX_REQUESTS = 1024  # sample requests that may wait
 NOTICE_PERIOD_S = 0.5  # how often the held-back are told why; clients send again only when they hear nothing
 COPY_BELOW_BYTES = 65_536  # ZeroMQ sends larger messages without copying them
@@ -115,10 +115,8 @@ class ReplayServer:
         self._spend("idle", begun)
         if ready:
             self._receive()
-        ends_s = time.perf_counter() + WORK_S
-        self._has_work = True
-        while self._has_work and time.perf_counter() < ends_s:
-            self._has_work = self._answer_next() | self._store_next()
+        # The same time for learner and actors, if both want all of it: neither can crowd out the other.
+        self._has_work = self._repeat(self._answer_next) | self._repeat(self._store_next)
         if self._clock() >= self._next_notice_s:
             self._notify()
         if self._snapshot_path is not None:
@@ -236,6 +234,16 @@ class ReplayServer:
             self._arrive(peer, Arrival(error.head, str(error)))
         else:
             self._refusals.count(error.fault, str(error))
+
+    def _repeat(self, step: Callable[[], bool]) -> bool:
+        """Repeats a step while it finds work, for WORK_S at most; returns whether it found any."""
+        ends_s = time.perf_counter() + WORK_S
+        found = False
+        while step():
+            found = True
+            if time.perf_counter() >= ends_s:
+                break
+        return found
 
     def _store_next(self) -> bool:
         """Stores or refuses the insert whose turn it is; returns whether there was one that need not wait."""

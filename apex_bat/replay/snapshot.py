@@ -1,8 +1,9 @@
 """Writes the replay to a file while it is in use, and reads it back.
 
-Rows never change once written, so a thread copies them to the file while inserts go on. When it is through, `advance`,
-called by the owner of the buffer, copies what is left at one moment: the items, and those slices of rows that were
-overwritten meanwhile. That moment is the snapshot; it is the only time in which the owner is held up.
+Rows never change once written, so a thread copies them to the file while inserts go on, and then once or twice more
+those slices in which rows were overwritten meanwhile. When it is through, `advance`, called by the owner of the buffer,
+copies what is left at one moment: the items, and the few slices that changed since. That moment is the snapshot; it is
+the only time in which the owner is held up.
 
 The file: a prefix, the sections one after the other, and a JSON header at the end that names each section's place, type
 and CRC-32. It is written beside, synced and renamed; the one before stays as `<name>.previous`. Nothing is pickled.
@@ -31,6 +32,7 @@ MAGIC = b"ABREPLAY"
 VERSION = 1
 PREFIX = struct.Struct("<8sIIQQ")  # magic, version, CRC-32 of the header, its offset, its size
 SLICE_ROWS = 1 << 14  # rows of a section: 3 MB of frames
+PASSES = 3  # over the rows; each is shorter than the one before
 
 
 class SnapshotError(RuntimeError):
@@ -57,7 +59,7 @@ class SnapshotWriter:
         self._buffer = buffer
         self._path = path
         self._beside = path.with_name(path.name + ".writing")
-        self._row_begun = buffer.counters.next_row
+        self._row_begun = 0  # rows from this one on have changed since they were written to the file
         self._rows_written = threading.Event()
         self._final_given = threading.Event()
         self._final: list[_Section] = []
@@ -100,22 +102,28 @@ class SnapshotWriter:
     def _last_sections(self) -> list[_Section]:
         """Copies the items, and the slices of rows that were written since the thread began."""
         sections = [_Section(name, 0, array.copy()) for name, array in self._buffer.item_arrays().items()]
-        num_rows = self._buffer.num_rows
-        changed = np.arange(self._row_begun, max(self._buffer.counters.next_row, self._row_begun))[-num_rows:]
-        for index in np.unique(changed % num_rows // SLICE_ROWS).tolist():
-            first = index * SLICE_ROWS
+        for first in self._changed_slices(self._buffer.counters.next_row):
             for name, array in self._buffer.row_arrays().items():
                 sections.append(_Section(name, first, array[first : first + SLICE_ROWS].copy()))
         return sections
+
+    def _changed_slices(self, next_row: int) -> list[int]:
+        """Returns the first places of the slices in which rows from `_row_begun` up to `next_row` stand."""
+        num_rows = self._buffer.num_rows
+        changed = np.arange(max(self._row_begun, next_row - num_rows), next_row)
+        return [int(index) * SLICE_ROWS for index in np.unique(changed % num_rows // SLICE_ROWS)]
 
     def _run(self) -> None:
         try:
             with self._beside.open("wb") as file:
                 entries: dict[tuple[str, int], dict[str, Any]] = {}
                 file.write(bytes(PREFIX.size))
-                for first in range(0, min(self._row_begun, self._buffer.num_rows), SLICE_ROWS):
-                    for name, array in self._buffer.row_arrays().items():
-                        _write(file, _Section(name, first, array[first : first + SLICE_ROWS]), entries)
+                for _ in range(PASSES):
+                    next_row = self._buffer.counters.next_row  # before the pass: what comes during it is left for later
+                    for first in self._changed_slices(next_row):
+                        for name, array in self._buffer.row_arrays().items():
+                            _write(file, _Section(name, first, array[first : first + SLICE_ROWS]), entries)
+                    self._row_begun = next_row
                 self._rows_written.set()
                 self._final_given.wait()
                 if self._abandoned:

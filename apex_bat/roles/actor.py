@@ -6,45 +6,55 @@ algorithm 1), which are exchanged for newer ones every `actor.weights_period` st
 
 from __future__ import annotations
 
-import logging
+from contextlib import ExitStack, closing
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from apex_bat.agent.exploration import GREEDY_EPSILON, annealed, choose_actions, ladder_of_actor
-from apex_bat.agent.inference import Policy, PolicyValues
+from apex_bat.agent.inference import Policy, PolicyValues, parameter_shapes
 from apex_bat.agent.n_step import Accumulator
 from apex_bat.experience import Chunk, States
 from apex_bat.replay.client import ReplayWriter
+from apex_bat.roles.episodes import EpisodeRecorder
+from apex_bat.roles.lines import ExperienceSink, WeightsSource
 from apex_bat.roles.plan import Assignment
 from apex_bat.roles.reporting import Phases, RoleReporter
-from apex_bat.simulation.vector import EchoFlightVector
+from apex_bat.simulation.vector import EchoFlightVector, Observation
 from apex_bat.transport.weights import WeightsSubscriber
 
-Observation = dict[str, NDArray[np.generic]]
-_log = logging.getLogger(__name__)
 _WAIT_S = 0.2
+_FLUSH_S = 1.0
 
 
 def run_actor(assignment: Assignment) -> None:
     """Flies until told to stop."""
-    actor = Actor(assignment)
-    try:
+    config, addresses, keys = assignment.config, assignment.addresses, assignment.keys()
+    shapes, most = parameter_shapes(config.network, config.state_steps), config.transport.max_message_bytes
+    with ExitStack() as stack:
+        weights = stack.enter_context(
+            closing(WeightsSubscriber(addresses.weights, shapes, keys=keys, max_message_bytes=most))
+        )
+        writer = stack.enter_context(
+            closing(ReplayWriter(addresses.replay, assignment.role.name, config.actor.window_chunks, keys=keys))
+        )
+        reporter = stack.enter_context(closing(RoleReporter(assignment)))
+        actor = stack.enter_context(closing(Actor(assignment, writer, weights, reporter)))
         while not assignment.stop.is_set():
             if actor.is_ready(_WAIT_S):
                 actor.step()
-        actor.flush(timeout_s=1.0)
-    finally:
-        actor.close()
+        writer.flush(_FLUSH_S)
 
 
 class Actor:
-    """The state of one actor: bats, policy, accumulators and the line to the replay."""
+    """The state of one actor: bats, policy, accumulators."""
 
-    def __init__(self, assignment: Assignment) -> None:
+    def __init__(
+        self, assignment: Assignment, writer: ExperienceSink, weights: WeightsSource, reporter: RoleReporter
+    ) -> None:
         config, role = assignment.config, assignment.role
-        self._config = config
+        self._config, self._writer, self._weights, self._reporter = config, writer, weights, reporter
         self._generator = assignment.generator()
         self._env = EchoFlightVector(
             config.bats_per_actor, config.arena, config.condition, body=config.body, rays=config.rays,
@@ -59,19 +69,14 @@ class Actor:
         ]
         self._policy = Policy(config.network, config.state_steps)
         self._learner_step = -1
-        keys, most = assignment.keys(), config.transport.max_message_bytes
-        self._weights = WeightsSubscriber(
-            assignment.addresses.weights, self._policy.shapes, keys=keys, max_message_bytes=most
-        )
-        self._writer = ReplayWriter(assignment.addresses.replay, role.name, config.actor.window_chunks, keys=keys)
-        self._reporter = RoleReporter(assignment)
         self._phases = Phases("simulation", "policy", "gathering")
         self._num_steps = 0
-        self._waiting_since: float | None = None
-        self._observation: Observation | None = None
+        self._has_begun = False
+        self._observation: Observation
         self._values: PolicyValues
         self._frames: NDArray[np.float32]
         self._returns = np.zeros(config.bats_per_actor)
+        self._recorder = EpisodeRecorder(assignment, self._env, float(self._epsilons[0]))
 
     def is_ready(self, timeout_s: float) -> bool:
         """Says whether a step can be taken now; else waits for weights or for the replay, and reports for whom."""
@@ -82,7 +87,7 @@ class Actor:
             self._writer.poll(timeout_s)
             if not self._writer.has_room:
                 return self._wait(f"waiting for the replay server: {self._writer.waiting or 'no answer'}")
-        if self._observation is None:
+        if not self._has_begun:
             self._begin()
         return True
 
@@ -90,8 +95,10 @@ class Actor:
         """Takes one step of all bats."""
         env, reporter = self._env, self._reporter
         actions = choose_actions(self._values.q, self._current_epsilons(), self._generator)
+        self._recorder.before(self._observation, self._values, int(actions[0]))
         with self._phases.of("simulation"):
-            observation, rewards, terminated, truncated, _ = env.step(actions)
+            observation, rewards, terminated, truncated, info = env.step(actions)
+        self._recorder.after(float(rewards[0]), info)
         with self._phases.of("policy"):
             values = self._policy(_states(observation))
         ended = terminated | truncated
@@ -102,6 +109,7 @@ class Actor:
         self._returns += rewards
         self._frames, self._observation, self._values = env.newest_frames.copy(), observation, values
         if ended.any():
+            self._recorder.end(ended, info)
             self._end_episodes(ended)
         self._num_steps += 1
         reporter.count("env_steps", len(actions))
@@ -110,21 +118,16 @@ class Actor:
         if reporter.is_due:
             self._report("flying")
 
-    def flush(self, timeout_s: float) -> None:
-        """Waits until the server has acknowledged everything, at most so long."""
-        self._writer.flush(timeout_s)
-
     def close(self) -> None:
-        """Closes the world and the sockets."""
+        """Closes the world."""
         self._env.close()
-        self._writer.close()
-        self._weights.close()
-        self._reporter.close()
 
     def _begin(self) -> None:
+        self._has_begun = True
         observation, _ = self._env.reset(seed=int(self._generator.integers(2**31)))
         self._observation, self._values = observation, self._policy(_states(observation))
         self._frames = self._env.newest_frames.copy()
+        self._recorder.begin(self._learner_step)
 
     def _current_epsilons(self) -> NDArray[np.float64]:
         if self._config.exploration.kind == "ladder":
@@ -168,6 +171,8 @@ class Actor:
         for values, first in zip(self._values, fresh, strict=True):
             values[ended] = first
         self._observation, self._frames = observation, self._env.newest_frames.copy()
+        if ended[0]:
+            self._recorder.begin(self._learner_step)
 
     def _take_up_weights(self, timeout_s: float) -> bool:
         if timeout_s > 0.0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from contextlib import ExitStack, closing
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from apex_bat.config import ConfigError
 from apex_bat.replay.client import ReplayReader
 from apex_bat.roles import checkpoint
 from apex_bat.roles.checkpoint import Checkpoint
+from apex_bat.roles.lines import BatchSource, WeightsSink
 from apex_bat.roles.plan import Assignment
 from apex_bat.roles.reporting import Phases, RoleReporter
 from apex_bat.storage import StorageError
@@ -24,42 +26,67 @@ _WAIT_S = 0.2
 
 def run_learner(assignment: Assignment) -> None:
     """Learns until told to stop or until `train.max_updates`, and writes a last checkpoint."""
-    learner = Learner(assignment)
-    try:
+    config, addresses, keys = assignment.config, assignment.addresses, assignment.keys()
+    agent, version = make_agent(assignment)
+    with ExitStack() as stack:
+        publisher = stack.enter_context(closing(WeightsPublisher(addresses.weights, keys=keys)))
+        reader = stack.enter_context(
+            closing(
+                ReplayReader(
+                    addresses.replay, config.learner.batch_size, config.learner.prefetch,
+                    learner_step=agent.num_updates, keys=keys, max_message_bytes=config.transport.max_message_bytes,
+                )
+            )
+        )  # fmt: skip
+        reporter = stack.enter_context(closing(RoleReporter(assignment, addresses.weights)))
+        learner = Learner(assignment, agent, version, reader, publisher, reporter)
         while not (assignment.stop.is_set() or learner.is_done):
             learner.step(_WAIT_S)
         learner.save()
-    finally:
-        learner.close()
+
+
+def make_agent(assignment: Assignment) -> tuple[D3QN, int]:
+    """Returns the agent and the version of its weights, continued from the run's newest checkpoint if there is one.
+
+    Raises:
+        StorageError: there are checkpoints, and none can be read.
+        ConfigError: the newest is of another network or other sensing than the settings say.
+    """
+    config = assignment.config
+    torch.set_num_threads(config.train.threads)
+    torch.manual_seed(config.seed)
+    agent = D3QN(config, device_of(config.device))
+    folder = assignment.run / "checkpoints"
+    found = checkpoint.load_newest(folder)
+    if found is None:
+        return agent, 0
+    if found.fingerprint != checkpoint.fingerprint(config):
+        raise ConfigError(f"{folder}: the newest checkpoint is of another network, sensing or condition")
+    agent.restore(found.arrays, found.learner_step)
+    state = np.frombuffer(bytes.fromhex(found.counters["torch_random"]), np.uint8).copy()
+    torch.set_rng_state(torch.from_numpy(state))
+    _log.info("continues from the checkpoint of update %d", found.learner_step)
+    return agent, int(found.counters["weights_version"])
 
 
 class Learner:
-    """The state of the learner: agent, line to the replay, broadcaster of weights."""
+    """The state of the learner: the agent, and when what is due."""
 
-    def __init__(self, assignment: Assignment) -> None:
-        """Continues from the newest checkpoint of the run folder, if there is one.
-
-        Raises:
-            StorageError: there are checkpoints, and none can be read.
-            ConfigError: the newest is of another network or other sensing than the settings say.
-        """
-        config = assignment.config
-        self._config = config
-        self._folder = assignment.run / "checkpoints"
-        torch.set_num_threads(config.train.threads)
-        torch.manual_seed(config.seed)
-        self._agent = D3QN(config, device_of(config.device))
-        self._version = 0
-        self._restore(checkpoint.load_newest(self._folder))
-        keys = assignment.keys()
-        self._publisher = WeightsPublisher(assignment.addresses.weights, keys=keys)
-        self._reader = ReplayReader(
-            assignment.addresses.replay, config.learner.batch_size, config.learner.prefetch,
-            learner_step=self._agent.num_updates, keys=keys, max_message_bytes=config.transport.max_message_bytes,
-        )  # fmt: skip
-        self._reporter = RoleReporter(assignment, assignment.addresses.weights)
+    def __init__(
+        self,
+        assignment: Assignment,
+        agent: D3QN,
+        version: int,
+        reader: BatchSource,
+        publisher: WeightsSink,
+        reporter: RoleReporter,
+    ) -> None:
+        """Broadcasts the agent's weights at once; `version` is that of the last ones broadcast in this run."""
+        self._config, self._folder = assignment.config, assignment.run / "checkpoints"
+        self._agent, self._version = agent, version
+        self._reader, self._publisher, self._reporter = reader, publisher, reporter
         self._phases = Phases("waiting", "update", "weights", "checkpoint")
-        self._checkpoint_due_s = time.monotonic() + config.checkpoint.period_s
+        self._checkpoint_due_s = time.monotonic() + self._config.checkpoint.period_s
         self._broadcast()
 
     @property
@@ -105,12 +132,6 @@ class Learner:
         )
         checkpoint.save(self._folder, state, self._config.checkpoint.keep)
 
-    def close(self) -> None:
-        """Ends the reader's thread and closes the sockets."""
-        self._reader.close()
-        self._publisher.close()
-        self._reporter.close()
-
     def _try_save(self) -> None:
         with self._phases.of("checkpoint"):
             try:
@@ -127,17 +148,6 @@ class Learner:
         with self._phases.of("weights"):
             self._version += 1
             self._publisher.publish(self._version, self._agent.num_updates, self._agent.weights())
-
-    def _restore(self, found: Checkpoint | None) -> None:
-        if found is None:
-            return
-        if found.fingerprint != checkpoint.fingerprint(self._config):
-            raise ConfigError(f"{self._folder}: the newest checkpoint is of another network, sensing or condition")
-        self._agent.restore(found.arrays, found.learner_step)
-        self._version = int(found.counters["weights_version"])
-        state = np.frombuffer(bytes.fromhex(found.counters["torch_random"]), np.uint8).copy()
-        torch.set_rng_state(torch.from_numpy(state))
-        _log.info("continues from the checkpoint of update %d", found.learner_step)
 
 
 def device_of(name: str) -> torch.device:

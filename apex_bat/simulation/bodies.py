@@ -12,10 +12,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from apex_bat.config.settings import Body
+from apex_bat.simulation.bullet import pybullet
 from apex_bat.simulation.layout import Arena, Pillar, Wall
 from apex_bat.simulation.meshes import Triangles, box_mesh, cylinder_mesh, place_mesh
 from apex_bat.simulation.models import load_model, model_parts

@@ -7,9 +7,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
+from apex_bat.simulation.bullet import pybullet
 from apex_bat.simulation.layout import ArenaError, Model
 from apex_bat.simulation.meshes import (
     Triangles,

@@ -11,13 +11,13 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import pybullet
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from apex_bat.config.settings import Rays
 from apex_bat.simulation.bodies import RAY_GROUP
+from apex_bat.simulation.bullet import pybullet
 from apex_bat.simulation.world import World
 
 Caster = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]

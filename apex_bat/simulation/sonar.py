@@ -3,7 +3,7 @@
 >>> import numpy as np
 >>> echo = Sonar().hear(azimuth_rad=np.array([0.0]), elevation_rad=np.array([0.0]), range_m=np.array([1.0]))
 >>> echo.level_db.round(1).tolist()
-[[53.6], [53.6]]
+[[54.3], [54.3]]
 >>> echo.frame.shape
 (2, 24)
 """
@@ -34,7 +34,8 @@ class Sonar:
     def __init__(self, sonar: settings.Sonar | None = None, **changes: Any) -> None:
         """Takes settings, and single ones to change: `Sonar(rendering="exact", call_level_db=95)`."""
         base = settings.Sonar() if sonar is None else sonar
-        self.settings = msgspec.convert(msgspec.structs.asdict(base) | changes, settings.Sonar)
+        given = {name: value.item() if isinstance(value, np.generic) else value for name, value in changes.items()}
+        self.settings = msgspec.convert(msgspec.structs.asdict(base) | given, settings.Sonar)
         self._receiver = receiver(self.settings)
 
     def listener(self, azimuth_rad: ArrayLike, elevation_rad: ArrayLike) -> Listener:

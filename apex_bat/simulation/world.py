@@ -14,11 +14,11 @@ import weakref
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from apex_bat.config.settings import Body
 from apex_bat.simulation.bodies import build_arena, build_bat
+from apex_bat.simulation.bullet import pybullet
 from apex_bat.simulation.ground import ground_plan
 from apex_bat.simulation.layout import Arena
 from apex_bat.simulation.motion import fly_arc

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import signal
 
 from apex_bat.simulation.block_filters import BlockFilter, BlockLowPass
 
 
-def sounds(num_parts: int) -> np.ndarray:
+def sounds(num_parts: int) -> NDArray[np.float64]:
     return np.random.default_rng(8).normal(size=(2, num_parts, 120))
 
 
@@ -18,14 +19,14 @@ def sounds(num_parts: int) -> np.ndarray:
 def test_real_filter_filters_each_part_alike(num_taps: int, num_parts: int) -> None:
     response, sound = np.random.default_rng(9).normal(size=num_taps), sounds(num_parts)
     filtered = BlockFilter(response[None, None], num_parts, 120, block=24)(sound)
-    np.testing.assert_allclose(filtered, signal.lfilter(response, 1.0, sound), atol=1e-5)
+    np.testing.assert_allclose(filtered, signal.lfilter(response, [1.0], sound), atol=1e-5)
 
 
 def test_mixing_filter_is_complex_multiplication() -> None:
     real, imaginary = np.random.default_rng(10).normal(size=(2, 30))
     sound = sounds(2)
     filtered = BlockFilter(np.array(((real, imaginary), (-imaginary, real))), 2, 120, block=20)(sound)
-    expected = signal.lfilter(real + 1j * imaginary, 1.0, sound[:, 0] + 1j * sound[:, 1])
+    expected = signal.lfilter(real + 1j * imaginary, [1.0], sound[:, 0] + 1j * sound[:, 1])
     np.testing.assert_allclose(filtered[:, 0] + 1j * filtered[:, 1], expected, atol=1e-5)
 
 

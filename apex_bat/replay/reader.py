@@ -12,6 +12,7 @@ import zmq
 from numpy.typing import NDArray
 
 from apex_bat.experience import Batch
+from apex_bat.replay.heap import keep_freed_memory
 from apex_bat.transport.messages import MessageError, PriorityUpdate, Sample, SampleRequest, Waiting, decode, encode
 from apex_bat.transport.security import Keys, TransportError
 from apex_bat.transport.sockets import MAX_MESSAGE_BYTES, Connection
@@ -49,6 +50,7 @@ class ReplayReader:
         ask_again_s: float = ASK_AGAIN_S,
         max_message_bytes: int = MAX_MESSAGE_BYTES,
     ) -> None:
+        keep_freed_memory()
         addresses = [address] if isinstance(address, str) else list(address)
         self._batch_size = batch_size
         self._prefetch = prefetch

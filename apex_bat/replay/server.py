@@ -20,6 +20,7 @@ import zmq
 
 from apex_bat.config.settings import Config
 from apex_bat.replay.arrivals import Arrival, Arrivals, StoredSequence
+from apex_bat.replay.heap import keep_freed_memory
 from apex_bat.replay.snapshot import SnapshotWriter, read_snapshot
 from apex_bat.replay.store import RefusedChunkError, ReplayStore
 from apex_bat.transport.messages import (
@@ -85,6 +86,7 @@ class ReplayServer:
         generation: int = 0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        keep_freed_memory()
         self.store = ReplayStore(config, generator)
         self._arrivals = Arrivals(config.actor.window_chunks)
         self._requests: deque[_Request] = deque()

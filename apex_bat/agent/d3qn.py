@@ -6,14 +6,16 @@ importance weights (Schaul et al. 2016), n-step targets, (centred) RMSprop and a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from apex_bat.agent.losses import double_q_target, td_errors, weighted_loss
-from apex_bat.agent.network import DuelingNetwork, load_parameters, parameters_of, to_tensors
+from apex_bat.agent.network import DuelingNetwork, Values, load_parameters, parameters_of
 from apex_bat.config import Config, settings
 from apex_bat.experience import Batch
 
@@ -44,18 +46,23 @@ class D3QN:
         self.target.requires_grad_(False)
         self.optimiser = _optimiser(self.online, config.learner)
         self.num_updates = 0
+        self._values: tuple[Callable[..., Values], Callable[..., Values]] = (self.online, self.target)
+        if config.learner.compile:
+            self._values = (torch.compile(self.online), torch.compile(self.target))
 
     def update(self, batch: Batch) -> Update:
         """Takes one step of gradient descent on a batch and copies the target network when its time has come."""
-        states = to_tensors(batch.states, self.device)
-        next_states = to_tensors(batch.next_states, self.device)
-        rewards, discounts, weights = (
-            torch.from_numpy(array).to(self.device) for array in (batch.rewards, batch.discounts, batch.weights)
+        online, target = self._values
+        states = [self._moved(array) for array in batch.states]
+        next_states = [self._moved(array) for array in batch.next_states]
+        rewards, discounts, weights, actions = (
+            self._moved(array) for array in (batch.rewards, batch.discounts, batch.weights, batch.actions)
         )
-        with torch.no_grad():
-            targets = double_q_target(rewards, discounts, self.online(*next_states).q, self.target(*next_states).q)
-        q = self.online(*states).q
-        errors = td_errors(q, torch.from_numpy(batch.actions).to(self.device), targets)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._settings.precision == "bfloat16"):
+            with torch.no_grad():
+                next_q_online, next_q_target = online(*next_states).q.float(), target(*next_states).q.float()
+            q = online(*states).q.float()
+        errors = td_errors(q, actions, double_q_target(rewards, discounts, next_q_online, next_q_target))
         loss = weighted_loss(errors, weights, self._settings.loss)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -97,6 +104,13 @@ class D3QN:
             raise ValueError("the checkpoint's optimiser state does not fit this network")
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
         self.num_updates = num_updates
+
+    def _moved(self, array: NDArray[Any]) -> Tensor:
+        """Returns an array on the device; to CUDA through pinned memory, so that the copy does not wait."""
+        tensor = torch.from_numpy(array)
+        if self.device.type == "cuda":
+            return tensor.pin_memory().to(self.device, non_blocking=True)
+        return tensor
 
     def _follow(self) -> None:
         period, tau = self._settings.target_period, self._settings.target_tau

@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from apex_bat.agent.inference import FILTER_BINS, num_bins_after
 from apex_bat.config import settings
-from apex_bat.experience import ACTION_MEMORY, NUM_ACTIONS, NUM_EARS, States
+from apex_bat.experience import ACTION_MEMORY, NUM_ACTIONS, NUM_EARS
 
 
 class Values(NamedTuple):
@@ -63,11 +63,6 @@ class DuelingNetwork(nn.Module):
         else:
             baseline = advantage.max(dim=1, keepdim=True).values
         return Values(value + advantage - baseline, value, advantage)
-
-
-def to_tensors(states: States, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Returns the echoes and the action memory of states as tensors on a device."""
-    return torch.from_numpy(states.echoes).to(device), torch.from_numpy(states.actions).to(device)
 
 
 def parameters_of(network: nn.Module) -> dict[str, NDArray[np.float32]]:

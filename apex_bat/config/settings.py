@@ -218,6 +218,10 @@ class Learner(Section, frozen=True):
     """Soft update: share of the online network taken over after each update (thesis: 0.001)."""
     weights_period: Count = 25
     """Updates between broadcasts of the weights."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Arithmetic of the network; bfloat16 by autocast, with float32 parameters, pays on CUDA and at large batches."""
+    compile: bool = False
+    """Whether torch compiles the network: a minute at the start (and a C++ compiler on a CPU) for a few percent."""
     prefetch: Annotated[int, Meta(ge=1, le=64)] = 4
     """Batches asked for ahead. Ape-X 16; each is that much older when it is used."""
 

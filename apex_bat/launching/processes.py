@@ -12,10 +12,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+from apex_bat.launching import ONE_THREAD
 from apex_bat.launching.supervisor import Exit
 from apex_bat.roles.plan import Role
-
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class RoleProcess:
@@ -26,7 +25,7 @@ class RoleProcess:
         self._log = run / "logs" / f"{role.name}.log"
         command = [sys.executable, "-m", "apex_bat", role.kind, "--run", str(run), "--leash",
                    "--number", str(role.number), "--incarnation", str(incarnation)]  # fmt: skip
-        environment = os.environ | dict.fromkeys(_ONE_THREAD, str(num_threads))
+        environment = os.environ | dict.fromkeys(ONE_THREAD, str(num_threads))
         flags = 0 if os.name == "posix" else subprocess.CREATE_NEW_PROCESS_GROUP  # type: ignore[attr-defined]
         with self._log.open("ab") as output:
             self._process = subprocess.Popen(  # noqa: S603  # our own command

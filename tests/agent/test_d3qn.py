@@ -118,6 +118,14 @@ def test_a_restored_agent_goes_on_bit_for_bit(optimiser: str, centred: bool) -> 
         np.testing.assert_array_equal(array, copy.arrays()[name])
 
 
+@pytest.mark.slow
+def test_a_compiled_network_learns_the_same() -> None:
+    plain, compiled = agent(), agent(compile=True)
+    batch = two_state_batch(np.random.default_rng(0))
+    for _ in range(3):
+        assert compiled.update(batch).loss == pytest.approx(plain.update(batch).loss, rel=1e-4)
+
+
 def test_state_of_another_optimiser_is_refused() -> None:
     other = agent(optimiser="adam")
     arrays = {name: array for name, array in other.arrays().items() if not name.startswith("optimiser/")}
@@ -138,6 +146,7 @@ def test_state_of_another_optimiser_is_refused() -> None:
         {"optimiser": "adam"},
         {"target_period": 1},
         {"target_period": 0},
+        {"precision": "bfloat16"},
     ],
 )
 def test_every_setting_of_the_learner_changes_what_is_learned(change: dict[str, object]) -> None:

@@ -25,9 +25,10 @@ class RefusedChunkError(ValueError):
 
 
 class _Means(NamedTuple):
-    """Running means over the sampled items."""
+    """Running means, over arriving inserts and over sampled items."""
 
     policy_lag: float = 0.0
+    sampled_lag: float = 0.0
     item_age: float = 0.0
 
 
@@ -64,7 +65,9 @@ class ReplayStore:
             largest_sample=config.learner.batch_size,
             never_block=settings.never_block,
         )
+        self._has_action_memory = config.sensing.action_memory
         self.learner_step = 0
+        self._updated_priorities = 0
         self._late_priorities = 0
         self._refused_priorities = 0
         self._actors: dict[str, int] = {}
@@ -92,6 +95,8 @@ class ReplayStore:
         self.buffer.add(chunks, priorities, index, learner_step)
         self.limiter.count_insert(len(priorities))
         self._inserted_by[index] += len(priorities)
+        lag = float(max(self.learner_step - learner_step, 0))
+        self._means = self._means._replace(policy_lag=_smoothed(self._means.policy_lag, lag))
 
     def can_add(self, num_transitions: int) -> bool:
         """Whether the limiter lets so many transitions in now."""
@@ -108,8 +113,13 @@ class ReplayStore:
         sampled = self.buffer.sample(num_transitions, self._beta(), self._generator)
         lag = float(np.maximum(learner_step - sampled.learner_steps, 0).mean())
         age = float((self.buffer.counters.next_item - sampled.batch.items).mean())
-        self._means = _Means(_smoothed(self._means.policy_lag, lag), _smoothed(self._means.item_age, age))
+        self._means = self._means._replace(
+            sampled_lag=_smoothed(self._means.sampled_lag, lag), item_age=_smoothed(self._means.item_age, age)
+        )
         self._sampled_by += np.bincount(sampled.actors, minlength=len(self._sampled_by))
+        if not self._has_action_memory:
+            sampled.batch.states.actions[:] = 0
+            sampled.batch.next_states.actions[:] = 0
         return sampled.batch
 
     def count_sample(self, num_transitions: int) -> None:
@@ -123,7 +133,9 @@ class ReplayStore:
         if not finite.all():
             self._refused_priorities += int(np.count_nonzero(~finite))
             items, errors = items[finite], errors[finite]
-        self._late_priorities += self.buffer.update(items, self._trusted(errors))
+        late = self.buffer.update(items, self._trusted(errors))
+        self._late_priorities += late
+        self._updated_priorities += len(items) - late
 
     def actor_shares(self) -> dict[str, tuple[float, float]]:
         """Returns for each actor its share of all inserted and of all sampled transitions."""
@@ -140,11 +152,13 @@ class ReplayStore:
             "replay.inserted": self.limiter.inserted,
             "replay.sampled": self.limiter.sampled,
             "replay.evicted": counters.first_item,
+            "replay.updated_priorities": self._updated_priorities,
             "replay.late_priorities": self._late_priorities,
             "replay.refused_priorities": self._refused_priorities,
             "replay.samples_per_insert": self.limiter.measured_ratio,
             "replay.balance": self.limiter.balance,
             "replay.policy_lag": self._means.policy_lag,
+            "replay.sampled_lag": self._means.sampled_lag,
             "replay.item_age": self._means.item_age,
             "replay.actors": len(self._actors),
             "replay.greatest_inserted_share": max((share for share, _ in shares), default=0.0),
@@ -161,6 +175,7 @@ class ReplayStore:
             "alpha": self.buffer.alpha,
             "limiter": list(self.limiter.counters()),
             "learner_step": self.learner_step,
+            "updated_priorities": self._updated_priorities,
             "late_priorities": self._late_priorities,
             "refused_priorities": self._refused_priorities,
             "actors": list(self._actors),
@@ -174,6 +189,7 @@ class ReplayStore:
         """Takes over what `state` returned; the buffer's arrays and counters are restored by `snapshot`."""
         self.limiter.restore(LimiterCounters(*state["limiter"]))
         self.learner_step = state["learner_step"]
+        self._updated_priorities = state["updated_priorities"]
         self._late_priorities = state["late_priorities"]
         self._refused_priorities = state["refused_priorities"]
         self._actors = {actor: i for i, actor in enumerate(state["actors"])}

@@ -63,6 +63,7 @@ def test_updates_change_the_sampling_and_bad_ones_are_counted(config: Config, ma
     store.update(3, np.array([0, 1, 77]), np.array([np.nan, 9.0, 9.0], np.float32))
     assert shares(store)[0] == pytest.approx(0.9, abs=0.01)
     assert store.metrics()["replay.late_priorities"] == 1
+    assert store.metrics()["replay.updated_priorities"] == 11
     assert store.metrics()["replay.refused_priorities"] == 1
 
 
@@ -70,7 +71,8 @@ def test_lag_age_and_shares_are_measured(config: Config, make_chunk: MakeChunk) 
     store = filled(with_replay(config, alpha=1.0, priority_epsilon=1e-9), make_chunk, (1.0, 0.0))
     store.sample(100, learner_step=30)  # only the first actor's ten, made at learner step 0
     figures = store.metrics()
-    assert figures["replay.policy_lag"] == 30.0
+    assert figures["replay.sampled_lag"] == 30.0
+    assert figures["replay.policy_lag"] == 0.0
     assert figures["replay.item_age"] == pytest.approx(15.5, abs=0.1)  # items 0 to 9 of 20
     assert store.actor_shares() == {"actor0": (0.5, 1.0), "actor1": (0.5, 0.0)}
     assert figures["replay.greatest_inserted_share"] == 0.5
@@ -115,3 +117,18 @@ def test_an_insert_with_a_bad_chunk_is_refused_whole_and_names_its_actor(config:
     with pytest.raises(RefusedChunkError, match="actor 7"):
         store.add("actor 7", 0, [make_chunk(10), bad])
     assert len(store.buffer) == 0
+
+
+def test_policy_lag_is_that_of_the_weights_that_flew_what_arrives(config: Config, make_chunk: MakeChunk) -> None:
+    store = filled(config, make_chunk, (1.0,))
+    store.learner_step = 40
+    store.add("late", 15, [make_chunk(10)])
+    assert store.metrics()["replay.policy_lag"] == 25.0
+
+
+def test_without_action_memory_the_learner_sees_no_actions(config: Config, make_chunk: MakeChunk) -> None:
+    deaf = msgspec.structs.replace(config, sensing=msgspec.structs.replace(config.sensing, action_memory=False))
+    for settings, expected in ((config, True), (deaf, False)):
+        batch = filled(settings, make_chunk, (1.0, 1.0)).sample(100, 0)
+        assert bool(batch.states.actions.any()) == expected
+        assert bool(batch.next_states.actions.any()) == expected

@@ -47,15 +47,17 @@ def train(
     console.print(title, highlight=False, soft_wrap=True)
     view = PlainView(console) if plain else view_for(console, title)
     try:
-        outcome, reason = local.train(config, folder, view)
+        ended = local.train(config, folder, view)
     except BaseException as error:
         runs.finish(folder, "failed", reason=str(error) or type(error).__name__)
         raise
-    runs.finish(folder, outcome, reason=reason)
-    if outcome == "failed":
-        typer.echo(f"apex-bat: {reason}; the logs are in {folder / 'logs'}", err=True)
+    runs.finish(
+        folder, ended.outcome, reason=ended.reason, env_steps=ended.env_steps, learner_steps=ended.learner_steps
+    )
+    if ended.outcome == "failed":
+        typer.echo(f"apex-bat: {ended.reason}; the logs are in {folder / 'logs'}", err=True)
         raise typer.Exit(1)
-    if outcome == "interrupted":
+    if ended.outcome == "interrupted":
         typer.echo(f"interrupted; the last checkpoint is in {folder / 'checkpoints'}", err=True)
         raise typer.Exit(130)
     conclude(folder, config, console)

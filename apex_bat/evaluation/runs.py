@@ -128,12 +128,24 @@ def evaluate(
         "learner_step": found.learner_step,
         "condition": config.condition,
         "rendering": config.sonar.rendering,
-        "training_seed": config.seed,
-        "wall_s": round(time.perf_counter() - began_s, 3),
+        "training": training_facts(folder, config),
+        "evaluation_wall_s": round(time.perf_counter() - began_s, 3),
         "summary": [summary([record for record in records if record.arena == arena], arena) for arena in arenas],
         "flights": [msgspec.to_builtins(record) for record in records],
     }
     return result, flights
+
+
+def training_facts(folder: Path, config: Config) -> dict[str, Any]:
+    """Returns what a reader of results wants to know of a run's training: seed, commit, times, size."""
+    path = folder / "run.json"
+    known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    facts = {name: known.get(name) for name in ("commit", "start", "end", "outcome", "env_steps", "learner_steps")}
+    facts |= {"seed": config.seed, "actors": config.actors, "bats_per_actor": config.bats_per_actor}
+    if facts["start"] and facts["end"]:
+        elapsed = datetime.fromisoformat(str(facts["end"])) - datetime.fromisoformat(str(facts["start"]))
+        facts["wall_s"] = elapsed.total_seconds()
+    return facts
 
 
 def summary(records: Sequence[FlightRecord], arena: str) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 
@@ -38,8 +38,18 @@ _log = logging.getLogger(__name__)
 Outcome = Literal["completed", "interrupted", "failed"]
 
 
-def train(config: Config, run: Path, view: View) -> tuple[Outcome, str]:
-    """Trains in a run folder made by `runs.create` and returns how it ended and, if it failed, why in one line."""
+class Ended(NamedTuple):
+    """How a run ended."""
+
+    outcome: Outcome
+    reason: str
+    """Why it failed, in one line; empty when it did not."""
+    env_steps: int
+    learner_steps: int
+
+
+def train(config: Config, run: Path, view: View) -> Ended:
+    """Trains in a run folder made by `runs.create` until a limit, Ctrl-C or a role that is given up."""
     with _terminable(), _addresses(config, run) as addresses:
         write_text(run / ADDRESSES, msgspec.json.encode(addresses).decode())
         keys = load_keys(Path(config.transport.keys)) if config.transport.keys else None
@@ -51,7 +61,7 @@ def train(config: Config, run: Path, view: View) -> tuple[Outcome, str]:
         finally:
             launch.end()
             collector.close()
-    return outcome, reason
+        return Ended(outcome, reason, *launch.counters())
 
 
 class _Launch:
@@ -77,6 +87,10 @@ class _Launch:
         except (RoleFailedError, StorageError) as error:
             return "failed", str(error)
         return "completed", ""
+
+    def counters(self) -> tuple[int, int]:
+        """Returns environment steps and updates of the whole run."""
+        return int(self._standing.env_steps), int(self._standing.learner_step)
 
     def end(self) -> None:
         """Stops the roles, the replay last, and kills what outlives its grace."""

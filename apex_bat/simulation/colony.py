@@ -17,7 +17,7 @@ from apex_bat.simulation import scoring
 from apex_bat.simulation.layout import Arena
 from apex_bat.simulation.motion import TURN_SIGN, step_length_m, step_turn_rad
 from apex_bat.simulation.progress import centre_lines
-from apex_bat.simulation.rays import RangeSensors, make_caster
+from apex_bat.simulation.rays import make_sensors
 from apex_bat.simulation.sensing import CONDITIONS, keep_onsets, silent_history, stack_echoes
 from apex_bat.simulation.sonar import Sonar
 from apex_bat.simulation.starts import start_region
@@ -72,7 +72,7 @@ class Colony:
         self._regions = [start_region(arena, self.body, self.episode) for arena in self.arenas]
         self._lines = centre_lines(self.arenas)
         self.world = World(self.arenas, self.body, num_bats, rays.max_range_m, gui)
-        self.sensors = RangeSensors(rays, self.body.sensor_height_m, make_caster(rays, self.world))
+        self.sensors = make_sensors(rays, self.body.sensor_height_m, self.world)
         self.ears = Sonar(sonar).listener(self.sensors.azimuth_rad, self.sensors.elevation_rad)
         self.generators = [np.random.default_rng() for _ in range(num_bats)]
         """One for each bat; the environments replace them when they are seeded."""

@@ -76,6 +76,12 @@ class Arena(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         if not (self.walls or self.pillars or self.models):
             raise ValueError("there are neither walls nor pillars nor models")
 
+    @property
+    def top_m(self) -> float | None:
+        """Height of all bodies, where all are upright and of one height; None where they are not."""
+        heights_m = {body.height_m for body in (*self.walls, *self.pillars)}
+        return heights_m.pop() if len(heights_m) == 1 and not self.models else None
+
     def corners(self) -> list[tuple[float, float]]:
         """Returns points x, y in metres whose bounding box holds all walls and pillars, and the start."""
         points = [self.start]

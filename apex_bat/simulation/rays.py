@@ -1,8 +1,11 @@
 """The range sensors: ray directions, and the two ways to cast them.
 
 Both casters return the distance along each ray to the first surface, and inf for a miss. They meet the same surfaces
-(see apex_bat.simulation.bodies). 16 bats' 21,760 rays take Embree 0.19 ms a bat in the arena simple; PyBullet takes
-7.4 ms (one core of a shared machine).
+(see apex_bat.simulation.bodies). Embree takes 0.15 us a ray in the arena simple; PyBullet takes 5.5 us.
+
+Where all bodies are upright and of one height, as in the thesis's arenas, a ray that rises at the elevation e meets what
+the level ray of its azimuth meets at the distance d, at the range d / cos e, unless it has risen above the bodies by
+then. So one level ray stands for a whole column of the 3D sensor: 460 rays are cast instead of 1360.
 """
 
 from __future__ import annotations
@@ -27,20 +30,27 @@ Caster = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32
 class RangeSensors:
     """The 3D sensor ahead, for the ear, and the 2D sensor around, for the reward; both cast in one go for all bats."""
 
-    def __init__(self, settings: Rays, height_m: float, cast: Caster) -> None:
+    def __init__(self, settings: Rays, height_m: float, cast: Caster, top_m: float | None = None) -> None:
         """Lays out the rays.
 
         Args:
             settings: number and layout of rays.
             height_m: height of both sensors above the floor.
             cast: a caster.
+            top_m: height of all bodies, where all are upright and higher than the sensors; None: cast every ray.
         """
         self._cast = cast
         self._height_m = height_m
         self.azimuth_rad, self.elevation_rad = ray_angles(settings)
-        around_rad = np.arange(settings.num_clearance, dtype=np.float64) * (2.0 * np.pi / settings.num_clearance)
         ahead = directions(self.azimuth_rad, self.elevation_rad)
+        self._reach_m, self._stretch = np.full((1, 1), np.inf, np.float32), np.ones((1, 1), np.float32)
+        if top_m is not None:
+            row_rad = self.elevation_rad[:: settings.num_azimuth, None]
+            ahead = directions(self.azimuth_rad[: settings.num_azimuth], np.zeros(settings.num_azimuth))
+            self._reach_m, self._stretch = level_reach(row_rad, top_m - height_m, settings.max_range_m)
+        around_rad = np.arange(settings.num_clearance, dtype=np.float64) * (2.0 * np.pi / settings.num_clearance)
         rays = np.concatenate([ahead, directions(around_rad, np.zeros_like(around_rad))])
+        self._num_ahead = len(ahead)
         self._ahead, self._aside, self._up = np.ascontiguousarray(rays.T, np.float32)
 
     def measure(self, poses: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
@@ -57,15 +67,44 @@ class RangeSensors:
         heading_rad = np.ascontiguousarray(poses[:, 2])
         cosine = np.cos(heading_rad).astype(np.float32)[:, None]
         sine = np.sin(heading_rad).astype(np.float32)[:, None]
-        rays = np.empty((num_bats, num_rays, 3), np.float32)
-        rays[:, :, 0] = cosine * self._ahead - sine * self._aside
-        rays[:, :, 1] = sine * self._ahead + cosine * self._aside
-        rays[:, :, 2] = self._up
-        sensors = np.column_stack([poses[:, :2], np.full(num_bats, self._height_m)]).astype(np.float32)
-        origins = np.repeat(sensors, num_rays, axis=0)
-        range_m = self._cast(origins, rays.reshape(-1, 3)).reshape(num_bats, num_rays)
-        points = len(self.azimuth_rad)
-        return range_m[:, :points], range_m[:, points:].min(axis=1).astype(np.float64)
+        origins, rays = np.empty((2, num_bats, num_rays, 3), np.float32)
+        rays[..., 0] = cosine * self._ahead - sine * self._aside
+        rays[..., 1] = sine * self._ahead + cosine * self._aside
+        rays[..., 2] = self._up
+        origins[..., 0], origins[..., 1], origins[..., 2] = poses[:, :1], poses[:, 1:2], self._height_m
+        distance_m = self._cast(origins.reshape(-1, 3), rays.reshape(-1, 3)).reshape(num_bats, num_rays)
+        ahead_m = distance_m[:, None, : self._num_ahead]
+        range_m = np.where(ahead_m <= self._reach_m, ahead_m * self._stretch, np.float32(np.inf))
+        clearance_m = distance_m[:, self._num_ahead :].min(axis=1)
+        return range_m.reshape(num_bats, -1), clearance_m.astype(np.float64)
+
+
+def make_sensors(settings: Rays, height_m: float, world: World) -> RangeSensors:
+    """Returns the sensors that the settings ask for; with Embree, level rays stand for columns where they can."""
+    if settings.caster == "pybullet":
+        return RangeSensors(settings, height_m, pybullet_caster(world.client, settings.max_range_m))
+    is_flat = world.top_m is not None and world.top_m > height_m
+    caster = embree_caster(world.triangles, settings.max_range_m)
+    return RangeSensors(settings, height_m, caster, world.top_m if is_flat else None)
+
+
+def level_reach(
+    elevation_rad: NDArray[np.float64], rise_m: float, max_range_m: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Returns how far on the level rays may meet bodies, and by how much their ranges are longer than that distance.
+
+    Args:
+        elevation_rad: float64, from 0 to below pi / 2.
+        rise_m: how far the bodies reach above the sensor.
+        max_range_m: the longest range.
+
+    Returns:
+        float32, min(rise / tan e, max_range cos e), and float32, 1 / cos e; of the shape of the elevations.
+    """
+    with np.errstate(divide="ignore"):  # a level ray stays below the top for ever
+        below_top_m = rise_m / np.tan(elevation_rad)
+    level = np.cos(elevation_rad)
+    return np.minimum(below_top_m, max_range_m * level).astype(np.float32), (1.0 / level).astype(np.float32)
 
 
 def ray_angles(settings: Rays) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -88,13 +127,6 @@ def directions(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.float
     """Returns unit vectors (points, 3): x forward, y left, z up; azimuth counter-clockwise, elevation up."""
     level = np.cos(elevation_rad)
     return np.stack([level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), np.sin(elevation_rad)], axis=1)
-
-
-def make_caster(settings: Rays, world: World) -> Caster:
-    """Returns the caster that the settings ask for."""
-    if settings.caster == "embree":
-        return embree_caster(world.triangles, settings.max_range_m)
-    return pybullet_caster(world.client, settings.max_range_m)
 
 
 def embree_caster(triangles: NDArray[np.float32], max_range_m: float) -> Caster:

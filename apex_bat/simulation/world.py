@@ -66,6 +66,9 @@ class World:
         """int64 (arenas, footprints), PyBullet's number of the body behind each footprint; -1 for padding."""
         self.triangles = np.concatenate([surface for _, surface in built]).astype(np.float32)
         """float32 (triangles, 3, 3), the surfaces of all fixed bodies, in the world's coordinates."""
+        tops_m = {arena.top_m for arena in arenas}
+        self.top_m = tops_m.pop() if len(tops_m) == 1 else None
+        """Height of all fixed bodies, where all are upright and of one height; None where they are not."""
         self.bats = [build_bat(self.client, body) for _ in range(num_bats)]
         """PyBullet's numbers of the robots."""
 

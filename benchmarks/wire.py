@@ -71,7 +71,7 @@ def _serve(
     server.close()
 
 
-class _Server:
+class ServerProcess:
     """A server process and what is shared with it."""
 
     def __init__(self, keys: Keys | None) -> None:
@@ -88,7 +88,7 @@ class _Server:
         self.stop.set()
         return self._figures.get(timeout=60)
 
-    def __enter__(self) -> _Server:
+    def __enter__(self) -> ServerProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -121,7 +121,7 @@ def _saturated(name: str, num_actors: int) -> list[Record]:
     """Returns the rates of a server that many synthetic actors and a learner load as much as they can."""
     inserted, batches = [], []
     for _ in range(ROUNDS):
-        with _Server(None) as server:
+        with ServerProcess(None) as server:
             targets = [(_act, (server.address, f"actor{i}", server.stop)) for i in range(num_actors)]
             clients = [_processes.Process(target=target, args=args, daemon=True) for target, args in targets]
             clients.append(_processes.Process(target=_learn, args=(server.address, server.stop), daemon=True))
@@ -145,7 +145,7 @@ def _insert_delays(name: str, keys: Keys | None) -> list[Record]:
     """Returns the time from sending 50 transitions to their acknowledgement, with nothing else going on."""
     chunk = synthetic_chunk(np.random.default_rng(0))
     delays_ms = []
-    with _Server(keys) as server:
+    with ServerProcess(keys) as server:
         writer = ReplayWriter(server.address, "actor", 64, keys=keys)
         for _ in range(INSERTS + WARM_UP_INSERTS):
             begun = time.perf_counter()

@@ -102,7 +102,7 @@ def arena(
 
 
 def bench(
-    part: Annotated[str, typer.Argument(help="What to measure: simulation, replay, wire, or all.")],
+    part: Annotated[str, typer.Argument(help="What to measure: simulation, replay, wire, learner, system, or all.")],
     json_file: Json = None,
 ) -> None:
     """Measure a part of the system on this machine, from a checkout."""

@@ -1,0 +1,64 @@
+"""Whole runs of a minute with 1, 2 and 4 actor processes: steps, updates and samples per insert.
+
+Run it with `apex-bat bench system` or `python -m benchmarks.system`. On two cores the roles share them: the figures say
+what such a machine gives, not how the system scales.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks.replay import Record, summary
+
+MINUTES = 0.75
+SETTLED_S = 20.0  # rows before this are left out: the replay fills, the learner has not begun
+NUM_ACTORS = (1, 2, 4)
+
+
+def measure() -> list[Record]:
+    """Returns the records that `apex-bat bench system` writes; a run is the rows of its reports, a second each."""
+    return [record for num_actors in NUM_ACTORS for record in _measure(num_actors)]
+
+
+def _measure(num_actors: int) -> list[Record]:
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "run"
+        command = [
+            sys.executable, "-m", "apex_bat", "train", "--plain", "--run", str(run),
+            "--set", f"actors={num_actors}", "--set", f"train.max_minutes={MINUTES}",
+            "--set", "evaluation.during_training=false", "--set", "evaluation.arenas=[]",
+        ]  # fmt: skip
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=os.environ)
+        rows = {path.stem: _rows(path) for path in (run / "metrics").glob("*.jsonl")}
+    name = f"system.actors_{num_actors}"
+    steps = [
+        sum(rates)
+        for rates in zip(*(_series(rows[f"actor-{i}"], "env_steps_per_s") for i in range(num_actors)), strict=False)
+    ]
+    replay = rows["replay"]
+    return [
+        summary(f"{name}.steps_per_s", "1/s", steps),
+        summary(f"{name}.updates_per_s", "1/s", _series(rows["learner"], "updates_per_s")),
+        summary(f"{name}.samples_per_insert", "1", _series(replay, "replay.samples_per_insert")),
+        summary(f"{name}.policy_lag", "updates", _series(replay, "replay.policy_lag")),
+        summary(f"{name}.learner_idle_share", "1", _series(rows["learner"], "share.waiting")),
+    ]
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return [row for row in rows if row["elapsed_s"] >= SETTLED_S]
+
+
+def _series(rows: list[dict[str, Any]], name: str) -> list[float]:
+    return [float(row[name]) for row in rows if name in row]
+
+
+if __name__ == "__main__":
+    print(json.dumps(measure(), indent=1))

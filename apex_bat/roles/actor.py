@@ -44,6 +44,7 @@ def run_actor(assignment: Assignment) -> None:
         while not assignment.stop.is_set():
             if actor.is_ready(_WAIT_S):
                 actor.step()
+        actor.report("sending the last chunks")
         writer.flush(_FLUSH_S)
 
 
@@ -76,7 +77,7 @@ class Actor:
         self._values: PolicyValues
         self._frames: NDArray[np.float32]
         self._returns = np.zeros(config.bats_per_actor)
-        self._recorder = EpisodeRecorder(assignment, self._env, float(self._epsilons[0]))
+        self._recorder = EpisodeRecorder(assignment, self._env, self._epsilons)
 
     def is_ready(self, timeout_s: float) -> bool:
         """Says whether a step can be taken now; else waits for weights or for the replay, and reports for whom."""
@@ -95,10 +96,10 @@ class Actor:
         """Takes one step of all bats."""
         env, reporter = self._env, self._reporter
         actions = choose_actions(self._values.q, self._current_epsilons(), self._generator)
-        self._recorder.before(self._observation, self._values, int(actions[0]))
+        self._recorder.before(self._observation, self._values, actions)
         with self._phases.of("simulation"):
             observation, rewards, terminated, truncated, info = env.step(actions)
-        self._recorder.after(float(rewards[0]), info)
+        self._recorder.after(rewards, info)
         with self._phases.of("policy"):
             values = self._policy(_states(observation))
         ended = terminated | truncated
@@ -116,7 +117,14 @@ class Actor:
         if self._num_steps % self._config.actor.weights_period == 0:
             self._take_up_weights(0.0)
         if reporter.is_due:
-            self._report("flying")
+            self.report("flying")
+
+    def report(self, state: str) -> None:
+        """Reports what the actor does, and its figures."""
+        self._reporter.gauge("learner_step", self._learner_step)
+        for name, value in self._writer.counters().items():
+            self._reporter.gauge(name, value)
+        self._reporter.send(state, self._phases)
 
     def close(self) -> None:
         """Closes the world."""
@@ -171,7 +179,7 @@ class Actor:
         for values, first in zip(self._values, fresh, strict=True):
             values[ended] = first
         self._observation, self._frames = observation, self._env.newest_frames.copy()
-        if ended[0]:
+        if ended[self._recorder.bat]:
             self._recorder.begin(self._learner_step)
 
     def _take_up_weights(self, timeout_s: float) -> bool:
@@ -187,14 +195,8 @@ class Actor:
     def _wait(self, reason: str) -> bool:
         self._reporter.count("waits", 1)
         if self._reporter.is_due:
-            self._report(reason)
+            self.report(reason)
         return False
-
-    def _report(self, state: str) -> None:
-        self._reporter.gauge("learner_step", self._learner_step)
-        for name, value in self._writer.counters().items():
-            self._reporter.gauge(name, value)
-        self._reporter.send(state, self._phases)
 
 
 def _states(observation: Observation) -> States:

@@ -42,6 +42,7 @@ def run_learner(assignment: Assignment) -> None:
         learner = Learner(assignment, agent, version, reader, publisher, reporter)
         while not (assignment.stop.is_set() or learner.is_done):
             learner.step(_WAIT_S)
+        learner.report("writing the last checkpoint")
         learner.save()
 
 
@@ -113,12 +114,16 @@ class Learner:
         if time.monotonic() >= self._checkpoint_due_s:
             self._try_save()
         if self._reporter.is_due:
-            self._reporter.gauge("learner_step", self._agent.num_updates)
-            self._reporter.gauge("weights_version", self._version)
-            for name, value in self._reader.counters().items():
-                self._reporter.gauge(name, value)
-            self._reporter.send("learning" if batch is not None else self._reader.waiting, self._phases)
+            self.report("learning" if batch is not None else self._reader.waiting)
         return batch is not None
+
+    def report(self, state: str) -> None:
+        """Reports what the learner does, and its figures."""
+        self._reporter.gauge("learner_step", self._agent.num_updates)
+        self._reporter.gauge("weights_version", self._version)
+        for name, value in self._reader.counters().items():
+            self._reporter.gauge(name, value)
+        self._reporter.send(state, self._phases)
 
     def save(self) -> None:
         """Writes a checkpoint.

@@ -27,9 +27,8 @@ def run_replay(assignment: Assignment) -> None:
         while not assignment.stop.is_set():
             server.serve(_WAIT_S)
             if reporter.is_due:
-                for name, value in server.metrics().items():
-                    reporter.gauge(name, value)
-                reporter.send(server.state())
+                _report(server, reporter, server.state())
+        _report(server, reporter, "writing the last snapshot")
         try:
             server.save()
         except OSError as error:
@@ -37,3 +36,9 @@ def run_replay(assignment: Assignment) -> None:
     finally:
         server.close()
         reporter.close()
+
+
+def _report(server: ReplayServer, reporter: RoleReporter, state: str) -> None:
+    for name, value in server.metrics().items():
+        reporter.gauge(name, value)
+    reporter.send(state)

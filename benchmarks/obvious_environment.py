@@ -88,7 +88,8 @@ class ObviousEnvironment:
         for _ in range(4):
             sound_pa = signal.lfilter([1.0 - abs(POLE)], [1.0, -POLE], sound_pa)
         compressed = np.maximum(2.0 * sound_pa.real, 0.0) ** 0.4
-        return np.asarray(signal.lfilter(*LOW_PASS, compressed).reshape(24, -1).mean(axis=1))
+        envelope = np.maximum(signal.lfilter(*LOW_PASS, compressed), 0.0)
+        return np.asarray(envelope.reshape(24, -1).mean(axis=1))
 
 
 def call() -> NDArray[np.float64]:

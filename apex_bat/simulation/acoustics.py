@@ -35,6 +35,9 @@ class Chance(NamedTuple):
     """(bats, 2, parts, samples): white noise of variance 1 at each ear; in the baseband, real and imaginary part."""
 
 
+NO_CHANCE = Chance(None, None, None)
+
+
 def draw_chance(
     sonar: settings.Sonar, generators: Sequence[np.random.Generator | None], num_points: int, num_samples: int
 ) -> Chance:
@@ -43,10 +46,12 @@ def draw_chance(
     Raises:
         ValueError: a random setting is on and a generator is missing.
     """
+    if not sonar.is_random:
+        return NO_CHANCE
     jitter_db: list[Floats] = []
     phase_cycles: list[Floats] = []
     noise: list[Floats] = []
-    for generator in generators if sonar.is_random else ():
+    for generator in generators:
         if generator is None:
             raise ValueError('level_jitter_db, receiver_noise_db and summation = "random_phase" need a generator')
         if sonar.level_jitter_db > 0.0:
@@ -174,17 +179,13 @@ def impulse_response(echoes: Floats, delay_samples: Floats, num_samples: int, *,
     """
     whole = np.floor(delay_samples) if is_shared else np.rint(delay_samples)
     length = num_samples + 1  # what comes too late falls into the last sample, which is cut off
-    num_rows = math.prod(echoes.shape[:-1])
-    row_starts = length * np.arange(num_rows).reshape(*echoes.shape[:-1], 1)
-    index = (whole.astype(np.intp) + row_starts).ravel()
-
-    def add_up(taps: Floats) -> Floats:
-        summed = np.bincount(index, taps.ravel(), minlength=num_rows * length)
-        return summed.reshape(*echoes.shape[:-1], length).astype(np.float64, copy=False)
-
-    taps = add_up(echoes)
+    shape = echoes.shape[:-1]
+    row_starts = np.arange(0.0, length * math.prod(shape), length).reshape(*shape, 1)
+    index = (whole + row_starts).astype(np.intp).ravel()
+    taps = np.bincount(index, echoes.ravel(), minlength=row_starts.size * length).reshape(*shape, length)
     if is_shared:
-        later = add_up(echoes * (delay_samples - whole))
-        taps -= later
-        taps[..., 1:] += later[..., :-1]
-    return taps[..., :num_samples]
+        later = (echoes * (delay_samples - whole)).ravel()
+        moved = np.bincount(index, later, minlength=row_starts.size * length).reshape(*shape, length)
+        taps -= moved
+        taps[..., 1:] += moved[..., :-1]
+    return taps[..., :num_samples].astype(np.float64, copy=False)

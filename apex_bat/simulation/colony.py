@@ -112,13 +112,14 @@ class Colony:
             actions: int64 (bats,).
             restart: int64 (n,), bats whose actions are ignored and whose episodes begin.
         """
-        everyone = np.arange(len(self.poses))
-        flying = everyone if restart is None else np.setdiff1d(everyone, restart)
+        is_flying = np.ones(len(self.poses), bool)
+        if restart is not None and len(restart):
+            is_flying[restart] = False
+            self._restart(restart, None)
+        flying = np.flatnonzero(is_flying)
         if len(flying):
             self._fly(flying, actions[flying])
-        if restart is not None and len(restart):
-            self._restart(restart, None)
-        self._hear(everyone)
+        self._hear(np.arange(len(self.poses)))
         self._score(flying, actions[flying])
 
     def observation(self) -> dict[str, NDArray[np.generic]]:
@@ -200,9 +201,9 @@ class Colony:
         return np.array([self.generators[row].standard_normal() for row in rows])
 
     def _hear(self, rows: Rows) -> None:
-        poses = self.poses[rows]
-        poses[:, :2] += self.world.offsets_m[self.arena_index[rows]]
-        range_m, self.clearance_m[rows] = self.sensors.measure(poses)
+        poses, arena = self.poses[rows], self.arena_index[rows]
+        poses[:, :2] += self.world.offsets_m[arena]
+        range_m, self.clearance_m[rows] = self.sensors.measure(poses, arena)
         frames = self.ears.frames(range_m, [self.generators[row] for row in rows])
         if self.condition == "onset":
             frames = keep_onsets(frames, self.sensing)

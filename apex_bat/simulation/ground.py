@@ -35,8 +35,7 @@ class Ground(NamedTuple):
             arena: int64 (points,), the arena that each point lies in.
         """
         x, y = points[:, :1], points[:, 1:2]
-        several = len(self.boxes) > 1  # a single arena's footprints need no copy for each point
-        boxes, circles = (self.boxes[arena], self.circles[arena]) if several else (self.boxes, self.circles)
+        boxes, circles = self._of(arena)
         dx, dy = x - boxes[:, :, 0], y - boxes[:, :, 1]
         cosine, sine = boxes[:, :, 2], boxes[:, :, 3]
         along = np.abs(cosine * dx + sine * dy) - boxes[:, :, 4]
@@ -46,9 +45,31 @@ class Ground(NamedTuple):
         to_circles = np.hypot(x - circles[:, :, 0], y - circles[:, :, 1]) - circles[:, :, 2]
         return np.concatenate([to_boxes, to_circles], axis=1)
 
+    def bearing_rad(self, points: NDArray[np.float64], arena: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Returns the directions from points to the nearest point of each footprint: float64 (points, boxes + circles).
+
+        Args:
+            points: float64 (points, 2), outside the footprints.
+            arena: int64 (points,), the arena that each point lies in.
+        """
+        x, y = points[:, :1], points[:, 1:2]
+        boxes, circles = self._of(arena)
+        dx, dy = x - boxes[:, :, 0], y - boxes[:, :, 1]
+        cosine, sine = boxes[:, :, 2], boxes[:, :, 3]
+        along, across = cosine * dx + sine * dy, cosine * dy - sine * dx
+        ahead = np.clip(along, -boxes[:, :, 4], boxes[:, :, 4]) - along
+        aside = np.clip(across, -boxes[:, :, 5], boxes[:, :, 5]) - across
+        to_x = np.concatenate([cosine * ahead - sine * aside, circles[:, :, 0] - x], axis=1)
+        to_y = np.concatenate([sine * ahead + cosine * aside, circles[:, :, 1] - y], axis=1)
+        return np.asarray(np.arctan2(to_y, to_x))
+
     def clearance_m(self, points: NDArray[np.float64], arena: NDArray[np.int64]) -> NDArray[np.float64]:
         """Returns the signed distance to the nearest footprint: float64 (points,)."""
         return np.asarray(self.distance_m(points, arena).min(axis=1))
+
+    def _of(self, arena: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns the footprints of some arenas; those of a single one need no copy for each point."""
+        return (self.boxes[arena], self.circles[arena]) if len(self.boxes) > 1 else (self.boxes, self.circles)
 
 
 def ground_plan(arenas: Sequence[Arena]) -> Ground:

@@ -79,7 +79,7 @@ class Arena(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     @property
     def top_m(self) -> float | None:
         """Height of all bodies, where all are upright and of one height; None where they are not."""
-        heights_m = {body.height_m for body in (*self.walls, *self.pillars)}
+        heights_m = {wall.height_m for wall in self.walls} | {pillar.height_m for pillar in self.pillars}
         return heights_m.pop() if len(heights_m) == 1 and not self.models else None
 
     def corners(self) -> list[tuple[float, float]]:

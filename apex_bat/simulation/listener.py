@@ -1,7 +1,8 @@
 """The fast ear of the environment: frames of many bats at once, for rays whose directions are fixed.
 
-It gives the frame of `Sonar.hear`, and to each bat the same bits alone and among others: what is done for all bats at
-once is element by element, and what sums over samples is done for one bat after another.
+It gives the frame of `Sonar.hear`, and to each bat the same bits alone and among others: what is done for several bats
+at once is element by element or a stack of products of one bat's arrays, and what depends on how a bat's echoes lie is
+done for one bat after another.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from apex_bat.simulation.block_filters import BlockFilter, BlockLowPass
 from apex_bat.simulation.directivity import directivity_db
 from apex_bat.simulation.receiver import LISTENING_S, receiver
 
-_CHANNEL_BLOCK = {"thesis": 60, "exact": 24}  # samples; measured: fastest
-_LOW_PASS_BLOCK = {"thesis": 60, "exact": 48}
-_BATS_TOGETHER = 2  # keeps arrays below what malloc asks of the kernel each time, which had cost 3 us a page
-_SILENCE = np.float32(1e-37)  # instead of 0, of which numpy's power is ten times slower
+_CHANNEL_BLOCK = {"thesis": 48, "exact": 24}  # samples; measured: fastest
+_LOW_PASS_BLOCK = {"thesis": 50, "exact": 48}
+_BATS_TOGETHER = 4  # keeps arrays below what malloc asks of the kernel each time, which had cost 3 us a page
+_SILENCE = np.float32(1e-37)  # instead of 0, whose logarithm is not finite
 
 Floats = NDArray[np.float64]
 
@@ -40,6 +41,7 @@ class Listener:
         self._receiver = receiver(sonar)
         self._num_samples, rate_hz = self._receiver.num_samples, self._receiver.sample_rate_hz
         num_parts = 1 if self._is_thesis else 2
+        self._num_parts = num_parts
         self._channel = self._block_filter(self._receiver.response, 1 if sonar.summation == "incoherent" else num_parts)
         self._noise_channel = self._block_filter(self._receiver.noise_pa * self._receiver.noise_response, num_parts)
         self._low_pass = BlockLowPass(rate_hz, self._num_samples, _LOW_PASS_BLOCK[sonar.rendering])
@@ -47,7 +49,8 @@ class Listener:
         scale = 1.0 if self._is_thesis else cochlea.CARRIER_MEAN
         self._average = np.full(samples_of_value, scale / samples_of_value, np.float32)
         phase = 2.0 * np.pi * sonar.frequency_hz / rate_hz * np.arange(self._num_samples)
-        self._carrier = np.sin(phase).astype(np.float32)
+        carrier = np.sin(phase) if self._is_thesis else np.ones(self._num_samples)
+        self._carrier = carrier.astype(np.float32)
 
     def frames(
         self, range_m: NDArray[np.float32], generators: Sequence[np.random.Generator] | None = None
@@ -76,11 +79,11 @@ class Listener:
         for first in range(0, num_bats, _BATS_TOGETHER):
             some = slice(first, first + _BATS_TOGETHER)
             chance = acoustics.draw_chance(self._sonar, drawn_from[some], num_points, self._num_samples)
-            taps = self._impulse_responses(range_m[some].astype(np.float64), chance)
-            for bat in range(len(taps)):
-                motion = self._motion(taps[bat], None if chance.noise is None else chance.noise[bat])
-                envelope = np.maximum(self._low_pass(self._compressed(motion)), 0.0)
-                frames[first + bat] = envelope.reshape(NUM_EARS, NUM_BINS, -1) @ self._average
+            motion = self._motion(range_m[some], chance)
+            envelope = self._low_pass(self._compressed(motion).reshape(-1, self._num_samples))
+            np.maximum(envelope, 0.0, out=envelope)
+            values = envelope.reshape(-1, NUM_BINS, len(self._average)) @ self._average
+            frames[some] = values.reshape(-1, NUM_EARS, NUM_BINS)
         return frames
 
     def _block_filter(self, response: NDArray[np.float64 | np.complex128], num_parts: int) -> BlockFilter:
@@ -92,8 +95,29 @@ class Listener:
         mixing = np.array(((real, imaginary), (-imaginary, real)))
         return BlockFilter(mixing[:, :1] if self._is_thesis else mixing, 2, self._num_samples, block)
 
-    def _impulse_responses(self, range_m: Floats, chance: acoustics.Chance) -> Floats:
-        """Returns (bats, 2, parts, samples): eq. 3.1.1 as a product of pressures, the directions' part known before."""
+    def _motion(self, range_m: NDArray[np.float32], chance: acoustics.Chance) -> NDArray[np.float32]:
+        """Returns what moves in some bats' channels, (bats, 2, parts, samples): at 125 kHz, or in the baseband."""
+        echoes, delay_samples = self._arrivals(range_m.astype(np.float64), chance)
+        first_samples = delay_samples.min(axis=(1, 2, 3), initial=self._num_samples).astype(np.int64).tolist()
+        taps = acoustics.impulse_response(echoes, delay_samples, self._num_samples, is_shared=not self._is_thesis)
+        motion = np.empty((len(range_m), NUM_EARS, self._num_parts, self._num_samples), np.float32)
+        for bat, first in enumerate(first_samples):
+            self._channel.sound[:] = taps[bat]
+            filtered = self._channel(first)
+            if self._sonar.summation == "incoherent":
+                filtered = np.sqrt(filtered) * self._carrier
+            motion[bat, :, : filtered.shape[1]] = filtered
+            motion[bat, :, filtered.shape[1] :] = 0.0
+            if chance.noise is not None:
+                self._noise_channel.sound[:] = chance.noise[bat]
+                motion[bat] += self._noise_channel()
+        return motion
+
+    def _arrivals(self, range_m: Floats, chance: acoustics.Chance) -> tuple[Floats, Floats]:
+        """Returns what each point adds to the impulse responses, (bats, 2, parts, points), and when, in samples.
+
+        Eq. 3.1.1 as a product of pressures, of which the directions' part is known before.
+        """
         path_m = acoustics.path_range_m(self._sonar, self._azimuth_rad, self._elevation_rad, range_m)
         near = acoustics.REFERENCE_RANGE_M / path_m
         spread = near * near * np.exp(-self._decay_m * path_m)
@@ -103,23 +127,15 @@ class Listener:
         pressure_pa *= pressure_pa >= self._floor_pa
         delay_s = np.minimum(path_m * (2.0 / self._sonar.speed_of_sound_m_s), LISTENING_S)
         echoes = acoustics.arrivals(self._sonar, pressure_pa, delay_s, chance)
-        delay_samples = delay_s[..., None, :] * self._receiver.sample_rate_hz
-        return acoustics.impulse_response(echoes, delay_samples, self._num_samples, is_shared=not self._is_thesis)
-
-    def _motion(self, taps: Floats, noise: Floats | None) -> NDArray[np.float32]:
-        """Returns what moves in one bat's channels, (2, parts, samples): at 125 kHz, or in the baseband."""
-        motion = self._channel(taps)
-        if self._sonar.summation == "incoherent":
-            motion = np.sqrt(motion) * self._carrier if self._is_thesis else np.sqrt(motion)
-        if noise is None:
-            return motion
-        noisy = self._noise_channel(noise)
-        noisy[:, : motion.shape[1]] += motion
-        return noisy
+        return echoes, delay_s[..., None, :] * self._receiver.sample_rate_hz
 
     def _compressed(self, motion: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Returns the rectified and compressed motion (2, samples); in the baseband |y|^0.4, without its factor."""
-        if self._is_thesis:
-            return np.asarray(np.maximum(motion[:, 0], _SILENCE) ** np.float32(cochlea.COMPRESSION))
-        power = np.square(motion).sum(axis=1)
-        return np.asarray(np.maximum(power, _SILENCE) ** np.float32(cochlea.COMPRESSION / 2.0))
+        """Returns the rectified and compressed motion (bats, 2, samples); in the baseband |y|^0.4, without its factor.
+
+        x^0.4 is computed as exp(0.4 ln x), which is twice as fast as numpy's power and as exact as the rest.
+        """
+        amplitude = motion[:, :, 0] if self._is_thesis else np.square(motion).sum(axis=2)
+        exponent = cochlea.COMPRESSION if self._is_thesis else cochlea.COMPRESSION / 2.0
+        logarithm = np.log(np.maximum(amplitude, _SILENCE))
+        logarithm *= np.float32(exponent)
+        return np.exp(logarithm, out=logarithm)

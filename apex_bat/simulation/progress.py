@@ -32,13 +32,16 @@ class CentreLines(NamedTuple):
             points: float64 (points, 2).
             arena: int64 (points,), the arena that each point lies in.
         """
-        away = points[:, None, :] - self.first[arena]
-        along = self.along[arena]
-        ahead_m = np.clip((away * along).sum(axis=2), 0.0, self.segment_m[arena])
-        distance_m = np.hypot(away[..., 0] - ahead_m * along[..., 0], away[..., 1] - ahead_m * along[..., 1])
-        nearest = distance_m.argmin(axis=1)
-        rows = np.arange(len(points))
-        return np.asarray(self.before_m[arena, nearest] + ahead_m[rows, nearest])
+        several = len(self.length_m) > 1  # a single arena's line needs no copy for each point
+        first, along, segment_m = (
+            part[arena] if several else part for part in (self.first, self.along, self.segment_m)
+        )
+        x, y = points[:, :1] - first[..., 0], points[:, 1:] - first[..., 1]
+        along_x, along_y = along[..., 0], along[..., 1]
+        ahead_m = np.clip(x * along_x + y * along_y, 0.0, segment_m)
+        squared = np.square(x - ahead_m * along_x) + np.square(y - ahead_m * along_y)
+        nearest = squared.argmin(axis=1)
+        return np.asarray(self.before_m[arena, nearest] + ahead_m[np.arange(len(points)), nearest])
 
     def advance(
         self, before_m: NDArray[np.float64], after_m: NDArray[np.float64], arena: NDArray[np.int64]

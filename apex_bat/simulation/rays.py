@@ -3,9 +3,7 @@
 Both casters return the distance along each ray to the first surface, and inf for a miss. They meet the same surfaces
 (see apex_bat.simulation.bodies). Embree takes 0.15 us a ray in the arena simple; PyBullet takes 5.5 us.
 
-Where all bodies are upright and of one height, as in the thesis's arenas, a ray that rises at the elevation e meets what
-the level ray of its azimuth meets at the distance d, at the range d / cos e, unless it has risen above the bodies by
-then. So one level ray stands for a whole column of the 3D sensor: 460 rays are cast instead of 1360.
+Where all bodies are upright and of one height most rays need not be cast (see apex_bat.simulation.prisms).
 """
 
 from __future__ import annotations
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from apex_bat.config.settings import Rays
 from apex_bat.simulation.bodies import RAY_GROUP
 from apex_bat.simulation.bullet import pybullet
+from apex_bat.simulation.prisms import Prisms, level_reach
 from apex_bat.simulation.world import World
 
 Caster = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]
@@ -30,81 +29,72 @@ Caster = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32
 class RangeSensors:
     """The 3D sensor ahead, for the ear, and the 2D sensor around, for the reward; both cast in one go for all bats."""
 
-    def __init__(self, settings: Rays, height_m: float, cast: Caster, top_m: float | None = None) -> None:
+    def __init__(self, settings: Rays, height_m: float, cast: Caster, prisms: Prisms | None = None) -> None:
         """Lays out the rays.
 
         Args:
             settings: number and layout of rays.
             height_m: height of both sensors above the floor.
             cast: a caster.
-            top_m: height of all bodies, where all are upright and higher than the sensors; None: cast every ray.
+            prisms: the bodies, if fewer rays will do for them; None: every ray is cast.
         """
-        self._cast = cast
-        self._height_m = height_m
+        self._cast, self._height_m, self._prisms = cast, height_m, prisms
         self.azimuth_rad, self.elevation_rad = ray_angles(settings)
-        ahead = directions(self.azimuth_rad, self.elevation_rad)
-        self._reach_m, self._stretch = np.full((1, 1), np.inf, np.float32), np.ones((1, 1), np.float32)
-        if top_m is not None:
-            row_rad = self.elevation_rad[:: settings.num_azimuth, None]
-            ahead = directions(self.azimuth_rad[: settings.num_azimuth], np.zeros(settings.num_azimuth))
-            self._reach_m, self._stretch = level_reach(row_rad, top_m - height_m, settings.max_range_m)
         around_rad = np.arange(settings.num_clearance, dtype=np.float64) * (2.0 * np.pi / settings.num_clearance)
-        rays = np.concatenate([ahead, directions(around_rad, np.zeros_like(around_rad))])
-        self._num_ahead = len(ahead)
-        self._ahead, self._aside, self._up = np.ascontiguousarray(rays.T, np.float32)
+        self._around = directions(around_rad, np.zeros_like(around_rad)).astype(np.float32)
+        self._ahead = directions(self.azimuth_rad, self.elevation_rad).astype(np.float32)
+        self._reach_m, self._stretch = np.full((1, 1), np.inf, np.float32), np.ones((1, 1), np.float32)
+        if prisms is not None:
+            column_rad, row_rad = self.azimuth_rad[: settings.num_azimuth], self.elevation_rad[:: settings.num_azimuth]
+            self._ahead = directions(column_rad, np.zeros_like(column_rad)).astype(np.float32)
+            self._reach_m, self._stretch = level_reach(row_rad[:, None], prisms.top_m - height_m, settings.max_range_m)
 
-    def measure(self, poses: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    def measure(
+        self, poses: NDArray[np.float64], arena: NDArray[np.int64] | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
         """Returns what the sensors read.
 
         Args:
             poses: float64 (bats, 3): x, y, heading in the world's coordinates.
+            arena: int64 (bats,), the arena that each is in; None: the first.
 
         Returns:
             float32 (bats, points), the ranges of the 3D sensor, inf for a miss, and float64 (bats,), the smallest
             reading of the 2D sensor: the clearance s of the reward, from the middle of the robot.
         """
-        num_bats, num_rays = len(poses), len(self._up)
+        num_ahead = len(self._ahead)
+        level_m = self._distance_m(poses, np.zeros(len(poses), np.int64) if arena is None else arena)
+        ahead_m, clearance_m = level_m[:, None, :num_ahead], level_m[:, num_ahead:].min(axis=1)
+        range_m = np.where(ahead_m <= self._reach_m, ahead_m * self._stretch, np.float32(np.inf))
+        return range_m.reshape(len(poses), -1), clearance_m.astype(np.float64)
+
+    def _distance_m(self, poses: NDArray[np.float64], arena: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Returns the distances along the rays that are cast: float32 (bats, rays), first those ahead."""
+        chosen = None if self._prisms is None else self._prisms.nearest_rays(poses, arena, len(self._around))
+        num_bats, num_ahead = len(poses), len(self._ahead)
+        around = self._around if chosen is None else self._around[chosen]
+        local = np.empty((num_bats, num_ahead + around.shape[-2], 3), np.float32)
+        local[:, :num_ahead], local[:, num_ahead:] = self._ahead, around
+        # Contiguous copies: numpy may round sines of strided arrays differently, and then neighbours would matter.
         heading_rad = np.ascontiguousarray(poses[:, 2])
         cosine = np.cos(heading_rad).astype(np.float32)[:, None]
         sine = np.sin(heading_rad).astype(np.float32)[:, None]
-        origins, rays = np.empty((2, num_bats, num_rays, 3), np.float32)
-        rays[..., 0] = cosine * self._ahead - sine * self._aside
-        rays[..., 1] = sine * self._ahead + cosine * self._aside
-        rays[..., 2] = self._up
+        origins, rays = np.empty((2, *local.shape), np.float32)
+        rays[..., 0] = cosine * local[..., 0] - sine * local[..., 1]
+        rays[..., 1] = sine * local[..., 0] + cosine * local[..., 1]
+        rays[..., 2] = local[..., 2]
         origins[..., 0], origins[..., 1], origins[..., 2] = poses[:, :1], poses[:, 1:2], self._height_m
-        distance_m = self._cast(origins.reshape(-1, 3), rays.reshape(-1, 3)).reshape(num_bats, num_rays)
-        ahead_m = distance_m[:, None, : self._num_ahead]
-        range_m = np.where(ahead_m <= self._reach_m, ahead_m * self._stretch, np.float32(np.inf))
-        clearance_m = distance_m[:, self._num_ahead :].min(axis=1)
-        return range_m.reshape(num_bats, -1), clearance_m.astype(np.float64)
+        return self._cast(origins.reshape(-1, 3), rays.reshape(-1, 3)).reshape(num_bats, -1)
 
 
 def make_sensors(settings: Rays, height_m: float, world: World) -> RangeSensors:
-    """Returns the sensors that the settings ask for; with Embree, level rays stand for columns where they can."""
+    """Returns the sensors that the settings ask for. PyBullet casts every ray; Embree no more than are needed."""
     if settings.caster == "pybullet":
         return RangeSensors(settings, height_m, pybullet_caster(world.client, settings.max_range_m))
-    is_flat = world.top_m is not None and world.top_m > height_m
-    caster = embree_caster(world.triangles, settings.max_range_m)
-    return RangeSensors(settings, height_m, caster, world.top_m if is_flat else None)
-
-
-def level_reach(
-    elevation_rad: NDArray[np.float64], rise_m: float, max_range_m: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Returns how far on the level rays may meet bodies, and by how much their ranges are longer than that distance.
-
-    Args:
-        elevation_rad: float64, from 0 to below pi / 2.
-        rise_m: how far the bodies reach above the sensor.
-        max_range_m: the longest range.
-
-    Returns:
-        float32, min(rise / tan e, max_range cos e), and float32, 1 / cos e; of the shape of the elevations.
-    """
-    with np.errstate(divide="ignore"):  # a level ray stays below the top for ever
-        below_top_m = rise_m / np.tan(elevation_rad)
-    level = np.cos(elevation_rad)
-    return np.minimum(below_top_m, max_range_m * level).astype(np.float32), (1.0 / level).astype(np.float32)
+    prisms = None
+    if world.top_m is not None and world.top_m > height_m:
+        prisms = Prisms(world.ground, world.offsets_m, world.top_m)
+    return RangeSensors(settings, height_m, embree_caster(world.triangles, settings.max_range_m), prisms)
 
 
 def ray_angles(settings: Rays) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

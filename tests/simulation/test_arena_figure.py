@@ -9,12 +9,23 @@ from PIL import Image
 from apex_bat.config.settings import Body
 from apex_bat.simulation.arena_figure import draw_arena, lines_across, shortest_lap
 from apex_bat.simulation.arenas import load_arena
+from apex_bat.simulation.ground import ground_plan
 
 
 def test_shortest_lap_round_a_pillar_is_a_circle() -> None:
     lap = shortest_lap(load_arena("circle"), Body())
     length_m = np.hypot(*(np.roll(lap, -1, axis=0) - lap).T).sum()
     assert length_m == pytest.approx(2 * np.pi * (1.07312 + 0.175), rel=0.01)
+
+
+def test_shortest_lap_is_straight_where_no_wall_holds_it() -> None:
+    arena = load_arena("simple")
+    lap = shortest_lap(arena, Body())
+    bend_m = np.hypot(*((np.roll(lap, 1, axis=0) + np.roll(lap, -1, axis=0)) / 2 - lap).T)
+    clearance_m = ground_plan([arena]).clearance_m(lap, np.zeros(len(lap), np.int64))
+    assert (clearance_m > 0.175).all()
+    assert bend_m[clearance_m > 0.175 + 0.02].max() < 1e-5
+    assert bend_m.max() > 1e-3
 
 
 def test_an_arena_without_a_centre_line_has_no_lap() -> None:

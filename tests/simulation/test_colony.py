@@ -15,6 +15,7 @@ def test_bodies_stand_where_the_bats_are() -> None:
     colony.begin(np.arange(3))
     for _ in range(3):
         colony.step(np.array([0, 1, 2]))
+    colony.world.show_bats()
     for bat, body in enumerate(colony.world.bats):
         place, _ = pybullet.getBasePositionAndOrientation(body, physicsClientId=colony.world.client)
         offset = colony.world.offsets_m[colony.arena_index[bat]]

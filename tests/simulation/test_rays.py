@@ -1,19 +1,23 @@
 """The range sensors against closed forms, and both casters against each other."""
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from apex_bat.config.settings import Body, Episode, Rays
 from apex_bat.simulation.arenas import load_arena
+from apex_bat.simulation.ground import ground_plan
 from apex_bat.simulation.layout import Arena, Model, Pillar, Wall
+from apex_bat.simulation.prisms import Prisms
 from apex_bat.simulation.rays import (
+    Caster,
     RangeSensors,
     directions,
     embree_caster,
-    make_caster,
-    pybullet_caster,
+    make_sensors,
     ray_angles,
 )
 from apex_bat.simulation.starts import start_region
@@ -31,6 +35,21 @@ SHAPES = """<robot name="shapes">
 <joint name="j" type="fixed"><parent link="base"/><child link="ball"/><origin xyz="0 0.8 0.5" rpy="0.4 0.2 0.1"/>
 </joint>
 </robot>"""
+
+
+CASTERS: tuple[Literal["embree", "pybullet"], ...] = ("embree", "pybullet")
+ARENAS = ["simple", "narrow", "circle", "circuit", "maze", "corridor:1", "forest:1"]
+
+
+def count_rays(caster: Caster) -> tuple[Caster, list[int]]:
+    """Returns a caster, and a list that tells how many rays each of its calls had."""
+    counts: list[int] = []
+
+    def cast(origins: NDArray[np.float32], rays: NDArray[np.float32]) -> NDArray[np.float32]:
+        counts.append(len(rays))
+        return caster(origins, rays)
+
+    return cast, counts
 
 
 def sensors(arena: Arena, rays: Rays) -> RangeSensors:
@@ -98,11 +117,64 @@ def test_clearance_looks_all_around_whatever_the_heading() -> None:
     np.testing.assert_allclose(clearance_m, 1.5, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["simple", "narrow", "circle", "circuit", "maze", "corridor:1", "forest:1"])
+@pytest.mark.parametrize("name", ARENAS)
 def test_embree_and_pybullet_agree_within_a_millimetre_misses_included(name: str) -> None:
     arena, generator = load_arena(name), np.random.default_rng(11)
     region = start_region(arena, Body(), Episode())
     assert_casters_agree(arena, np.array([region.sample(generator) for _ in range(12)]))
+
+
+@pytest.mark.parametrize("name", ARENAS)
+def test_rays_that_are_left_out_read_what_they_would_have_read(name: str) -> None:
+    arena, generator = load_arena(name), np.random.default_rng(12)
+    corners = np.array(arena.corners())
+    low, high = (*corners.min(axis=0), -np.pi), (*corners.max(axis=0), np.pi)
+    poses = generator.uniform(low, high, (400, 3))
+    poses = poses[ground_plan([arena]).clearance_m(poses[:, :2], np.zeros(400, np.int64)) > 0.1]
+    with World([arena], Body(), 0) as world:
+        few, cast = count_rays(embree_caster(world.triangles, 20.0))
+        prisms = Prisms(world.ground, world.offsets_m, 1.0)
+        range_m, clearance_m = RangeSensors(Rays(), HEIGHT_M, few, prisms).measure(poses)
+        every, cast_all = count_rays(embree_caster(world.triangles, 20.0))
+        full = RangeSensors(Rays(), HEIGHT_M, every)
+        full_range_m, full_clearance_m = full.measure(poses)
+    shorter_m = np.minimum(np.minimum(range_m, full_range_m), 20.0)
+    at_the_top = np.abs(HEIGHT_M + shorter_m * np.sin(full.elevation_rad) - 1.0) < 1e-5
+    np.testing.assert_allclose(range_m[~at_the_top], full_range_m[~at_the_top], atol=2e-4, rtol=0)
+    np.testing.assert_allclose(clearance_m, full_clearance_m, atol=1e-4, rtol=0)
+    assert at_the_top.mean() < 1e-3
+    assert np.isinf(range_m).any()
+    assert sum(cast) < sum(cast_all) / 5
+
+
+def test_bats_of_several_arenas_get_the_rays_of_their_own() -> None:
+    arenas = [load_arena("simple"), load_arena("circle"), load_arena("forest:1")]
+    which, poses = np.array([0, 1, 2]), np.array([[*arena.start, 0.3] for arena in arenas])
+    with World(arenas, Body(), 0) as world:
+        poses[:, :2] += world.offsets_m
+        together = make_sensors(Rays(), HEIGHT_M, world).measure(poses, which)
+        full = RangeSensors(Rays(), HEIGHT_M, embree_caster(world.triangles, 20.0)).measure(poses)
+    for k in range(2):
+        np.testing.assert_allclose(together[k], full[k], atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("arena", "height_m"),
+    [
+        (
+            Arena(start=(0.0, 0.0), walls=(Wall(2.0, 0.0, 0.3, 4.0, 0.15, 1.0), Wall(0.0, 2.0, 0.0, 4.0, 0.15, 0.7))),
+            0.4,
+        ),
+        (PILLAR, 1.0),
+    ],
+    ids=["bodies of different heights", "a sensor as high as the bodies"],
+)
+def test_every_ray_is_cast_where_bodies_are_no_prisms_above_the_sensors(arena: Arena, height_m: float) -> None:
+    with World([arena], Body(), 0) as world:
+        measured = make_sensors(Rays(), height_m, world).measure(np.zeros((1, 3)))
+        full = RangeSensors(Rays(), height_m, embree_caster(world.triangles, 20.0)).measure(np.zeros((1, 3)))
+    for k in range(2):
+        np.testing.assert_array_equal(measured[k], full[k])
 
 
 def test_embree_and_pybullet_agree_on_a_users_model(tmp_path: Path) -> None:
@@ -115,11 +187,9 @@ def test_embree_and_pybullet_agree_on_a_users_model(tmp_path: Path) -> None:
 
 def assert_casters_agree(arena: Arena, poses: np.ndarray) -> None:
     with World([arena], Body(), 1) as world:
-        world.place(
-            np.zeros(1, np.int64), poses[:1], np.zeros(1, np.int64)
-        )  # rays must pass through the bat's own body
-        casters = embree_caster(world.triangles, 20.0), pybullet_caster(world.client, 20.0)
-        readings = [RangeSensors(Rays(), HEIGHT_M, caster).measure(poses) for caster in casters]
+        world.place(np.zeros(1, np.int64), poses[:1], np.zeros(1, np.int64))
+        world.show_bats()  # rays must pass through the bat's own body
+        readings = [make_sensors(Rays(caster=caster), HEIGHT_M, world).measure(poses) for caster in CASTERS]
     (embree_m, embree_clearance_m), (pybullet_m, pybullet_clearance_m) = readings
     assert np.isfinite(embree_m).any()
     np.testing.assert_allclose(embree_m, pybullet_m, atol=1e-3, rtol=0)
@@ -139,7 +209,11 @@ def test_surface_of_a_users_model_lies_where_its_solids_are(tmp_path: Path) -> N
         assert cast(origins, (towards / distance_m).astype(np.float32))[0] == pytest.approx(distance_m - 0.3, abs=2e-3)
 
 
-def test_the_caster_is_a_setting() -> None:
+def test_the_caster_is_a_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr("apex_bat.simulation.rays.pybullet_caster", lambda client, _: asked.append(client))
     with World([WALL], Body(), 0) as world:
-        names = [make_caster(Rays(caster=caster), world).__qualname__ for caster in ("embree", "pybullet")]
-    assert names == ["embree_caster.<locals>.cast", "pybullet_caster.<locals>.cast"]
+        make_sensors(Rays(), HEIGHT_M, world)
+        assert not asked
+        make_sensors(Rays(caster="pybullet"), HEIGHT_M, world)
+        assert asked == [world.client]

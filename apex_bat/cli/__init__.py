@@ -11,7 +11,7 @@ import sys
 import typer
 
 from apex_bat import __version__
-from apex_bat.cli import judging, roles, training
+from apex_bat.cli import inspecting, judging, roles, training
 from apex_bat.config import ConfigError
 from apex_bat.launching import ONE_THREAD
 
@@ -27,7 +27,7 @@ app = typer.Typer(
 )
 app.command("train")(training.train)
 app.command("evaluate")(judging.evaluate)
-app.command("inspect")(judging.inspect)
+app.command("inspect")(inspecting.inspect)
 app.command("status")(judging.status)
 app.command("arena")(judging.arena)
 app.command("bench")(judging.bench)
@@ -75,6 +75,8 @@ def _report(error: Exception) -> int:
         "TransportError": 1,
         "RunError": 1,
         "RecordingError": 1,
+        "FilmError": 1,
+        "ScreenshotError": 1,
         "SnapshotError": 1,
     }  # by name: their modules need not be installed
     if isinstance(error, StorageError):

@@ -1,4 +1,4 @@
-"""Commands that look at runs and arenas: `evaluate`, `inspect`, `status`, `arena`, `bench`."""
+"""Commands that look at runs and arenas: `evaluate`, `status`, `arena`, `bench`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def evaluate(
     """Fly the best policy of a run greedily, until 1000 steps or a wall, and print what came of it."""
     from apex_bat.cli.training import print_result
     from apex_bat.evaluation import runs
-    from apex_bat.recording.keeping import keep_flights
+    from apex_bat.recording.keeping import keep_flights, num_logged
     from apex_bat.simulation.arenas import load_arena
 
     config = runs.load_config(run)
@@ -35,37 +35,14 @@ def evaluate(
         load_arena(name)
     result, recorded = runs.evaluate(
         run, chosen, flights or config.evaluation.flights,
-        config.evaluation.start_seed if seed is None else seed, num_recorded=record,
+        config.evaluation.start_seed if seed is None else seed, num_recorded=num_logged(config.recording, record),
     )  # fmt: skip
     text = json.dumps(result, indent=1) + "\n"
     (run / "evaluation" / f"{time.strftime('%Y%m%d-%H%M%S')}.json").write_text(text, encoding="utf-8")
     if json_file is not None:
         json_file.write_text(text, encoding="utf-8")
-    keep_flights(recorded, config, run)
+    keep_flights(recorded, config, run, num_first=record)
     print_result(result, Console())
-
-
-def inspect(
-    run: RunFolder,
-    web: Annotated[bool, typer.Option("--web", help="In the browser instead of the native viewer.")] = False,
-    show_list: Annotated[bool, typer.Option("--list", help="List the recordings and open nothing.")] = False,
-    png: Annotated[Path | None, typer.Option(help="Draw the first recording into this file, without a viewer.")] = None,
-) -> None:
-    """Open the flight recordings of a run in the rerun viewer, laid out."""
-    from apex_bat.recording import viewing
-
-    paths = viewing.recordings(run)
-    if show_list:
-        table = Table("recording", "MB", "written")
-        for path in paths:
-            written = time.strftime("%Y-%m-%d %H:%M", time.localtime(path.stat().st_mtime))
-            table.add_row(path.name, f"{path.stat().st_size / 1e6:.1f}", written)
-        Console().print(table)
-    elif png is not None:
-        viewing.draw(paths[0], png)
-        print(f"drawn: {png}")
-    else:
-        raise typer.Exit(viewing.open_viewer(run, paths, web=web))
 
 
 def status(run: RunFolder, json_file: Json = None) -> None:
@@ -102,7 +79,9 @@ def arena(
 
 
 def bench(
-    part: Annotated[str, typer.Argument(help="What to measure: simulation, replay, wire, learner, system, or all.")],
+    part: Annotated[
+        str, typer.Argument(help="What to measure: simulation, replay, wire, recording, learner, system, or all.")
+    ],
     json_file: Json = None,
 ) -> None:
     """Measure a part of the system on this machine, from a checkout."""

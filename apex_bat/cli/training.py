@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from contextlib import nullcontext, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,6 +27,9 @@ def train(
     run: Annotated[
         Path | None, typer.Option("--run", help="Run folder to make. [default: runs/NAME-DATE-TIME]")
     ] = None,
+    rerun: Annotated[
+        bool, typer.Option("--rerun", help="Stream flights and curves to a rerun viewer that is open on this machine.")
+    ] = False,
     plain: Annotated[bool, typer.Option("--plain", help="Plain lines instead of the live view.")] = False,
 ) -> int:
     """Train on this machine: actors, replay, learner and evaluator as processes; then evaluate the best checkpoint.
@@ -36,6 +40,8 @@ def train(
     from apex_bat.evaluation import runs
     from apex_bat.launching import local
     from apex_bat.launching.live import PlainView, view_for
+    from apex_bat.recording.streaming import streamer
+    from apex_bat.storage import StorageError
 
     config = load(config_file, overrides or ())
     check(config)
@@ -47,13 +53,16 @@ def train(
     console.print(title, highlight=False, soft_wrap=True)
     view = PlainView(console) if plain else view_for(console, title)
     try:
-        ended = local.train(config, folder, view)
+        with streamer(folder) if rerun else nullcontext():
+            ended = local.train(config, folder, view)
     except BaseException as error:
-        runs.finish(folder, "failed", reason=str(error) or type(error).__name__)
+        with suppress(StorageError):  # of a full disk, which is then the error at hand
+            runs.finish(folder, "failed", reason=str(error) or type(error).__name__)
         raise
-    runs.finish(
-        folder, ended.outcome, reason=ended.reason, env_steps=ended.env_steps, learner_steps=ended.learner_steps
-    )
+    with suppress(StorageError):
+        runs.finish(
+            folder, ended.outcome, reason=ended.reason, env_steps=ended.env_steps, learner_steps=ended.learner_steps
+        )
     if ended.outcome == "failed":
         typer.echo(f"apex-bat: {ended.reason}; the logs are in {folder / 'logs'}", err=True)
         raise typer.Exit(1)
@@ -89,9 +98,9 @@ def check(config: Config) -> None:
 def conclude(folder: Path, config: Config, console: Console) -> None:
     """Evaluates the best checkpoint of a run, records flights of it, prints the result and where everything is."""
     from apex_bat.evaluation import runs
-    from apex_bat.recording.keeping import keep_flights
+    from apex_bat.recording.keeping import keep_flights, num_logged
 
-    evaluation = config.evaluation
+    evaluation, num_first = config.evaluation, config.recording.evaluation_flights
     if not evaluation.arenas:
         return
     console.print(
@@ -100,10 +109,10 @@ def conclude(folder: Path, config: Config, console: Console) -> None:
     )
     result, flights = runs.evaluate(
         folder, evaluation.arenas, evaluation.flights, evaluation.start_seed,
-        num_recorded=config.recording.evaluation_flights,
+        num_recorded=num_logged(config.recording, num_first),
     )  # fmt: skip
     (folder / "evaluation" / "final.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    keep_flights(flights, config, folder)
+    keep_flights(flights, config, folder, num_first=num_first)
     print_result(result, console)
     console.print(f"run folder:  {folder}\nrecordings:  apex-bat inspect {folder}\n"
                   f"pictures:    {folder / 'figures'}", highlight=False, soft_wrap=True)  # fmt: skip
@@ -111,13 +120,14 @@ def conclude(folder: Path, config: Config, console: Console) -> None:
 
 def print_result(result: dict[str, Any], console: Console) -> None:
     """Prints the summary of an evaluation as a table."""
+    from rich.markup import escape
     from rich.table import Table
 
     title = f"{result['run']}: {result['condition']}, {result['checkpoint']}, update {result['learner_step']}"
     table = Table(title=title, title_justify="left")
     columns = ("arena", "complete", "steps", "distance [m]", "progress [m]", "straight [%]", "clearance [m]")
     for name in columns:
-        table.add_column(name, justify="left" if name == "arena" else "right")
+        table.add_column(escape(name), justify="left" if name == "arena" else "right")
     for row in result["summary"]:
         table.add_row(
             row["arena"], f"{row['completed']} of {row['flights']}", f"{row['steps_mean']:.0f}",

@@ -47,7 +47,7 @@ class Rays(Section, frozen=True):
     """The range sensors. The 3D one feeds the ear, the 2D one the reward (thesis section 3.1)."""
 
     caster: Literal["embree", "pybullet"] = "embree"
-    """Who intersects rays with the bodies: Embree on their meshes (44 times faster), or PyBullet itself."""
+    """Who intersects rays with the bodies: Embree on their meshes, or PyBullet itself (slower)."""
     num_azimuth: Count = 100
     """Columns of the 3D sensor, spread evenly over the azimuth span."""
     num_elevation: Count = 10
@@ -288,8 +288,8 @@ class Actor(Section, frozen=True):
 
     chunk_transitions: Annotated[int, Meta(ge=1, le=1000)] = 50
     """Transitions of one bat sent together (Ape-X: 50)."""
-    window_chunks: Annotated[int, Meta(ge=1, le=1024)] = 64
-    """Chunks sent and not yet acknowledged before an actor waits for the server."""
+    window_chunks: Annotated[int, Meta(ge=1, le=1024)] = 16
+    """Chunks sent and not yet acknowledged before an actor waits; more lets experience grow stale at a busy server."""
     weights_period: Count = 20
     """Steps of a bat between looks for newer weights (Ape-X: 400 frames, 5 to 10 s of flight)."""
 
@@ -357,13 +357,23 @@ class Recording(Section, frozen=True):
     """What is written to rerun recordings."""
 
     evaluation_flights: CountOrZero = 3
-    """Flights recorded of the evaluation after training, in each arena."""
-    every_episodes: CountOrZero = 0
-    """Actor 0 records every n-th episode of its first bat; 0: none."""
+    """Flights recorded of the evaluation after training, in each arena: the first so many. 0: nothing of it."""
+    extremes: bool = True
+    """Whether the best and the worst of those flights are recorded besides, marked in their names."""
+    crashes: CountOrZero = 2
+    """How many further flights of each arena that ended at a wall are recorded besides, marked in their names."""
+    sampled_flights: CountOrZero = 1
+    """Flights recorded of each evaluation during training."""
+    every_episodes: CountOrZero = 20
+    """The actors below record every n-th episode of their least exploring bat; 0: none."""
+    actors: tuple[CountOrZero, ...] = (0,)
+    """Numbers of the actors that record."""
     heavy_period_steps: Count = 5
-    """Waveforms, cochleagrams and points are written at every n-th step; poses and values at each."""
+    """Points, the stages of the ear and cochleagrams are written at every n-th step; poses and values at each."""
+    curves: bool = True
+    """Whether the course of the training is recorded too, in recordings/training.rrd."""
     max_mb: Positive = 500.0
-    """The oldest recordings of episodes go when they exceed this together."""
+    """Recordings go when they exceed this together: training before evaluation, marked ones last, the oldest first."""
 
 
 class Launch(Section, frozen=True):

@@ -9,7 +9,7 @@ from typing import Any
 
 from apex_bat.config import ConfigError
 
-PARTS = ("simulation", "replay", "wire", "learner", "system")
+PARTS = ("simulation", "replay", "wire", "recording", "learner", "system")
 _CHECKOUT = Path(__file__).resolve().parents[2]
 
 

@@ -94,7 +94,7 @@ def fly(
             if (terminated | truncated).any() and flying.any():
                 # The bats that have ended fly on uncounted, so that the others keep their places in the batch.
                 observation, _ = env.reset(options={"reset_mask": terminated | truncated})
-        return log.records(), log.flights
+        return log.records(), sorted(log.flights, key=lambda flight: flight.facts.episode)
     finally:
         env.close()
 

@@ -4,19 +4,27 @@ from __future__ import annotations
 
 import math
 from types import TracebackType
-from typing import Protocol
+from typing import Any, Protocol
 
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.panel import Panel
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from apex_bat.launching.sparklines import History, sparkline
 from apex_bat.launching.standing import Standing
 from apex_bat.launching.supervisor import Watched
 
 PLAIN_PERIOD_S = 10.0
+WIDE = 120
+"""Columns from which the figures stand in five pairs a row instead of three."""
+FIGURES_LINES = 9
+ROOMY_LINES = 30
+"""Lines below the figures from which there are curves too."""
+CURVES = ("greedy return", "test flights [m]", "loss", "mean Q", "steps/s", "updates/s")
+"""What the curves show."""
 
 
 class View(Protocol):
@@ -63,11 +71,13 @@ class PlainView:
 
 
 class TerminalView:
-    """Figures, progress and roles in panels that fit 80 x 24."""
+    """Figures, progress and roles in panels that fit 80 x 24; with more room, curves of the run so far."""
 
     def __init__(self, console: Console, title: str) -> None:
-        self._title = title
+        self._console, self._title = console, title
         self._live = Live(console=console, refresh_per_second=4, transient=False)
+        self._histories = {name: History() for name in CURVES}
+        self.renderable: RenderableType = ""
 
     def __enter__(self) -> TerminalView:
         self._live.__enter__()
@@ -80,21 +90,51 @@ class TerminalView:
 
     def show(self, standing: Standing, watched: dict[str, Watched]) -> None:
         """Draws the panels anew."""
-        self._live.update(
-            Group(Panel(self._figures(standing), title=self._title, title_align="left"), _roles(standing, watched))
-        )
+        for name, value in zip(CURVES, _curve_values(standing), strict=True):
+            self._histories[name].take(value, standing.now_s)
+        width, height = self._console.size
+        parts: list[RenderableType] = [Panel(_figures(standing, width), title=self._title, title_align="left")]
+        height -= FIGURES_LINES
+        if height >= ROOMY_LINES:
+            parts.append(Panel(self._curves(width - 4), title="since the start", title_align="left"))
+            height -= len(CURVES) + 2
+        self.renderable = Group(*parts, _roles(standing, watched, height))
+        self._live.update(self.renderable)
 
-    @staticmethod
-    def _figures(standing: Standing) -> Group:
-        table = Table.grid(padding=(0, 2), expand=True)
-        for _ in range(3):
-            table.add_column(style="dim")
-            table.add_column(justify="right")
-        rows = figures(standing)
-        for i in range(0, len(rows), 3):
-            table.add_row(*(cell for pair in rows[i : i + 3] for cell in pair))
-        share = max((used / limit for _, used, limit in standing.limits), default=0.0)
-        return Group(table, ProgressBar(total=1.0, completed=min(share, 1.0)))
+    def _curves(self, width: int) -> Table:
+        table = Table.grid(padding=(0, 2))
+        for name, history in self._histories.items():
+            values = [value for value in history.values if not math.isnan(value)]
+            newest = f"{values[-1]:.4g}" if values else "-"
+            table.add_row(Text(name, style="dim"), sparkline(history.values, width - 30), newest)
+        return table
+
+
+def _figures(standing: Standing, width: int) -> Group:
+    pairs = 5 if width >= WIDE else 3
+    table = Table.grid(padding=(0, 2), expand=True)
+    for _ in range(pairs):
+        table.add_column(style="dim")
+        table.add_column(justify="right")
+    rows = figures(standing)
+    for i in range(0, len(rows), pairs):
+        table.add_row(*(cell for pair in rows[i : i + pairs] for cell in pair))
+    share = max((used / limit for _, used, limit in standing.limits), default=0.0)
+    return Group(table, ProgressBar(total=1.0, completed=min(share, 1.0)))
+
+
+def _curve_values(standing: Standing) -> tuple[float, ...]:
+    """The figures of `CURVES` now."""
+    learner, evaluator = standing.roles["learner"], standing.roles.get("evaluator")
+    greedy = standing.recent("return_greedy")
+    return (
+        math.nan if greedy is None else greedy,
+        math.nan if evaluator is None else evaluator.gauge("progress_m"),
+        learner.gauge("loss"),
+        learner.gauge("q_mean"),
+        standing.env_steps_per_s,
+        learner.gauge("updates_per_s"),
+    )
 
 
 def figures(standing: Standing) -> list[tuple[str, str]]:
@@ -121,12 +161,16 @@ def figures(standing: Standing) -> list[tuple[str, str]]:
     ]
 
 
-def _roles(standing: Standing, watched: dict[str, Watched]) -> Table:
+def _roles(standing: Standing, watched: dict[str, Watched], height: int) -> Table:
+    """A row a role; many actors that do the same share one when the lines would not suffice."""
     table = Table(expand=True, box=None, pad_edge=False)
     for name in ("role", "pid", "restarts", "heard"):
         table.add_column(name, justify="left" if name == "role" else "right", no_wrap=True)
-    table.add_column("doing", ratio=1, no_wrap=True, overflow="ellipsis")
-    for row in standing.status(watched):
+    table.add_column("doing", ratio=1)
+    rows = standing.status(watched)
+    if 2 * len(rows) > height:  # what they do may take two lines
+        rows = _joined(rows)
+    for row in rows:
         age = row["heartbeat_age_s"]
         style = "yellow" if age is None or age > 5.0 else ""
         table.add_row(
@@ -134,6 +178,29 @@ def _roles(standing: Standing, watched: dict[str, Watched]) -> Table:
             Text("-" if age is None else f"{age:.0f} s", style=style), row["state"],
         )  # fmt: skip
     return table
+
+
+def _joined(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows, those of actors that do the same made one, which is as long unheard of as the worst of them."""
+    joined: list[dict[str, Any]] = []
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        if row["role"].startswith("actor"):
+            groups.setdefault(row["state"].partition(":")[0], []).append(row)
+        else:
+            joined.append(row)
+    for state, alike in groups.items():
+        ages = [row["heartbeat_age_s"] for row in alike]
+        joined.append(
+            {
+                "role": f"{len(alike)} actors" if len(alike) > 1 else alike[0]["role"],
+                "pid": alike[0]["pid"] if len(alike) == 1 else None,
+                "restarts": sum(row["restarts"] for row in alike),
+                "heartbeat_age_s": None if None in ages else max(ages),
+                "state": state,
+            }
+        )
+    return joined
 
 
 def _number(value: float | None, decimals: int = 0) -> str:

@@ -24,6 +24,7 @@ from apex_bat.launching.processes import RoleProcess
 from apex_bat.launching.standing import Standing
 from apex_bat.launching.supervisor import RoleFailedError, Supervisor
 from apex_bat.recording.metrics import MetricsWriter
+from apex_bat.recording.training import TrainingRecording
 from apex_bat.roles.plan import Addresses, Role, roles_of
 from apex_bat.roles.process import ADDRESSES
 from apex_bat.storage import StorageError, write_text
@@ -71,7 +72,8 @@ class _Launch:
         self._config, self._run, self._collector = config, run, collector
         self._supervisor = Supervisor(roles_of(config), self._start, config.launch)
         self._standing = Standing(config, time.monotonic())
-        self._metrics = MetricsWriter(run / "metrics")
+        training = TrainingRecording(config, run) if config.recording.curves else None
+        self._metrics = MetricsWriter(run / "metrics", training)
         self._status_due_s = 0.0
 
     def follow(self, view: View) -> tuple[Outcome, str]:
@@ -134,7 +136,8 @@ class _Launch:
         running = self._supervisor.stop(names)
         deadline_s = time.monotonic() + grace_s
         while running and time.monotonic() < deadline_s:
-            self._take_reports(0.05)
+            with suppress(StorageError):  # a full disk must not keep the roles from ending
+                self._take_reports(0.05)
             for watched in running:
                 ended = watched.handle.poll() if watched.handle is not None else None
                 if ended is not None:

@@ -1,71 +1,148 @@
-"""Layouts of the viewer: *flight* (default), *ear* (one call, every stage large) and *policy*."""
+"""Layouts of the viewer: *flight* (default), *ear* (one call, every stage large), *policy*, and two side by side."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
-import rerun as rr
 import rerun.blueprint as rrb
 
-from apex_bat.recording.outlines import arena_extent_m
+from apex_bat.config import Config
+from apex_bat.recording.curves import EPSILON_PATH, EVENTS_PATH, HISTOGRAM_PATH, LADDER_PATH
 from apex_bat.recording.series import EAR_NAMES
+from apex_bat.recording.views import HIDDEN, Views, curves
 from apex_bat.simulation.layout import Arena
 
 APPLICATION_ID = "apex_bat"
-EYE_FOV_RAD = math.radians(55.0)  # vertical, the viewer's own
-
-_PAST = rr.VisibleTimeRange("step", start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative())
-_PAST_S = rr.VisibleTimeRange(
-    "sim_time", start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
+CHAIN = (
+    ("waveform", "1 Sound [Pa over ms]"),
+    ("gammatone", "2 Gammatone channel at the call's frequency [Pa]"),
+    ("rectified", "3 Rectified [Pa]"),
+    ("compressed", "4 Compressed, x^0.4"),
+    ("envelope", "5 Low-passed at 1 kHz"),
+    ("frame", "6 Echo frame: means over 1 ms"),
 )
-_LASTING = rrb.VisibleTimeRanges([_PAST, _PAST_S])
+"""The chain of thesis fig. 3.6: entity of each stage and its name."""
 
 
-def flight_blueprint(arena: Arena | None = None) -> rrb.Blueprint:
-    """Returns the default layout: chase view and map, both ears, state, values, actions, reward, clearance."""
+def flight_blueprint(arena: Arena | None = None, *, is_playing: bool = False) -> rrb.Blueprint:
+    """Returns the default layout: chase view and map, both ears, state, values, actions, reward, clearance.
+
+    It begins paused, or playing in real time.
+    """
+    views = Views(arena)
     return _blueprint(
         rrb.Horizontal(
             rrb.Vertical(
-                rrb.Horizontal(_chase(), _map(arena)),
-                _actions(),
-                rrb.Horizontal(_clearance(), _reward()),
-                row_shares=[5, 1.1, 2],
+                rrb.Horizontal(views.chase(), views.map()),
+                views.actions(close_up=True),
+                rrb.Horizontal(views.clearance(), views.reward(close_up=True)),
+                row_shares=[5, 1, 2],
             ),
             rrb.Vertical(
-                rrb.Horizontal(*map(_waveform, EAR_NAMES)),
-                rrb.Horizontal(*map(_cochleagram, EAR_NAMES)),
-                _state(),
-                _q(),
+                rrb.Horizontal(*map(views.waveform, EAR_NAMES)),
+                rrb.Horizontal(*map(views.cochleagram, EAR_NAMES)),
+                views.state(),
+                views.q(close_up=True),
                 row_shares=[2, 2, 2, 2],
             ),
             column_shares=[5, 4],
-        )
+        ),
+        is_playing=is_playing,
     )
 
 
 def ear_blueprint(arena: Arena | None = None) -> rrb.Blueprint:
-    """Returns the layout of one call: for each ear the points by level, waveform, cochleagram and frame, large."""
-    del arena
-    columns = [
-        rrb.Vertical(_points(ear), _waveform(ear), _cochleagram(ear), _frame(ear), row_shares=[3, 2, 2, 2])
+    """Returns the layout of one call: levels of the points and cochleagrams, and the stages of each ear in a column."""
+    views = Views(arena)
+    seen = rrb.Vertical(*map(views.points, EAR_NAMES), *map(views.cochleagram, EAR_NAMES), row_shares=[3, 3, 3, 3])
+    chains = [
+        rrb.Vertical(
+            *(views.stage(stage, ear, f"{name}, {ear}") for stage, name in CHAIN), row_shares=[5, 5, 4, 4, 4, 4]
+        )
         for ear in EAR_NAMES
     ]
-    return _blueprint(rrb.Horizontal(*columns))
+    return _blueprint(rrb.Horizontal(seen, *chains, column_shares=[3, 4, 4]))
 
 
 def policy_blueprint(arena: Arena | None = None) -> rrb.Blueprint:
-    """Returns the layout of decisions: state, Q values, value, advantages, actions, reward and what came of them."""
+    """Returns the layout of decisions: state, Q values, value, advantages, actions, reward and what came of them.
+
+    Values and actions are shown around the cursor, what came of them over the whole flight.
+    """
+    views = Views(arena)
     return _blueprint(
         rrb.Horizontal(
-            rrb.Vertical(_state(), _map(arena), row_shares=[2, 3]),
-            rrb.Vertical(_q(), _value(), _advantage(), _actions(), row_shares=[2, 2, 2, 1.2]),
-            rrb.Vertical(_reward(), _return(), _clearance(), _progress(), _events()),
-            column_shares=[5, 4, 4],
+            rrb.Vertical(views.state(), views.map(), row_shares=[1, 2.6]),
+            rrb.Vertical(
+                views.q(close_up=True),
+                views.value(),
+                views.advantage(),
+                views.reward(close_up=True),
+                views.actions(close_up=True),
+                row_shares=[3, 2, 3, 2, 1.3],
+            ),
+            rrb.Vertical(views.returns(), views.clearance(), views.progress(), views.events()),
+            column_shares=[4, 5, 4],
         )
     )
 
 
+def pair_blueprint(arena: Arena | None, names: tuple[str, str]) -> rrb.Blueprint:
+    """Returns the layout of two flights side by side, whose entities lie below `a` and `b`."""
+    columns = []
+    for prefix, name in zip(PAIR, names, strict=True):
+        views = Views(arena, prefix, name)
+        columns.append(
+            rrb.Vertical(
+                rrb.Horizontal(views.chase(), views.map()),
+                views.state(),
+                views.q(close_up=True),
+                views.actions(close_up=True),
+                views.clearance(),
+                row_shares=[6, 3.2, 2.4, 1.6, 2],
+            )
+        )
+    return _blueprint(rrb.Horizontal(*columns))
+
+
+def training_blueprint(config: Config) -> rrb.Blueprint:
+    """Returns the layout of the course of a training."""
+    actors = [f"actor-{number}" for number in range(config.actors)]
+    below, above = rrb.Corner2D.RightBottom, rrb.Corner2D.LeftTop
+    exploring: rrb.View = rrb.BarChartView(name="Epsilon of each bat", origin=LADDER_PATH, plot_legend=HIDDEN)
+    if config.exploration.kind == "anneal":
+        exploring = curves("Epsilon of all bats", EPSILON_PATH)
+    columns = rrb.TextLogColumns(timeline_columns=["elapsed"], text_log_columns=["body"])
+    return _blueprint(
+        rrb.Grid(
+            curves("Return in training: all bats", *(f"{actor}/return" for actor in actors), legend=below),
+            curves("Return in training: greedy bats", *(f"{actor}/return_greedy" for actor in actors), legend=below),
+            curves("Test flights: share complete", "evaluator/completed_share"),
+            curves("Test flights: progress [m]", "evaluator/progress_m"),
+            curves("Loss", "learner/loss"),
+            curves("Mean Q of the sampled actions", "learner/q_mean"),
+            curves("Norm of the gradient", "learner/gradient_norm"),
+            curves("Norms of the weights", "evaluator/weights_norm", "learner/weights_norm", legend=below),
+            curves("Steps and updates [1/s]", *(f"{actor}/rate" for actor in actors), "learner/rate", legend=above),
+            curves("Transitions in and out of the replay [1/s]", "replay/rate", legend=above),
+            curves("Samples per insert", "replay/samples_per_insert"),
+            curves("Policy lag [updates]", "replay/policy_lag"),
+            rrb.Tabs(
+                exploring,
+                rrb.BarChartView(name="Priorities in the replay", origin=HISTOGRAM_PATH, plot_legend=HIDDEN),
+                active_tab=0,
+            ),
+            curves("Learner's idle share", "learner/idle_share"),
+            curves("Transitions held", "replay/size"),
+            rrb.TextLogView(name="Events", origin=EVENTS_PATH, columns=columns),
+            grid_columns=4,
+        ),
+        timeline="elapsed",
+    )
+
+
+PAIR = ("a", "b")
+"""First parts of the entity paths of two flights side by side."""
 BLUEPRINTS = {"flight": flight_blueprint, "ear": ear_blueprint, "policy": policy_blueprint}
 
 
@@ -83,126 +160,10 @@ def save_blueprints(folder: Path, arena: Arena | None = None) -> list[Path]:
     return paths
 
 
-def _blueprint(root: rrb.Container) -> rrb.Blueprint:
+def _blueprint(root: rrb.Container, timeline: str = "step", *, is_playing: bool = False) -> rrb.Blueprint:
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline="step", fps=20, play_state="paused"),
+        rrb.TimePanel(state="collapsed", timeline=timeline, fps=20, play_state="playing" if is_playing else "paused"),
     )
-
-
-def _chase() -> rrb.View:
-    eye = rrb.EyeControls3D(kind="orbital", position=(-2.2, 0.0, 1.6), look_target=(1.2, 0.0, 0.0), eye_up=(0, 0, 1))
-    return rrb.Spatial3DView(
-        name="Behind the bat (points: echo level, violet to yellow)",
-        origin="world/bat",
-        contents="world/**",
-        eye_controls=eye,
-        line_grid=False,
-        overrides={"world/trajectory": _LASTING, "world/contacts": _LASTING},
-    )
-
-
-def _map(arena: Arena | None) -> rrb.View:
-    eye = None
-    if arena is not None:
-        extent = arena_extent_m(arena)
-        x, y = (extent.x_min + extent.x_max) / 2, (extent.y_min + extent.y_max) / 2
-        half = max(extent.x_max - extent.x_min, extent.y_max - extent.y_min) / 2 + 0.5
-        height = 1.15 * half / math.tan(EYE_FOV_RAD / 2)  # the panel may be narrower than high
-        eye = rrb.EyeControls3D(
-            kind="orbital", position=(x, y - 0.001, height), look_target=(x, y, 0), eye_up=(0, 1, 0)
-        )
-    return rrb.Spatial3DView(
-        name="Map",
-        origin="world",
-        contents=["$origin/**", "- world/bat/points"],
-        eye_controls=eye,
-        line_grid=False,
-        overrides={
-            "world/trajectory": _LASTING,
-            "world/contacts": _LASTING,
-            "world/arena/walls": rr.Boxes3D.from_fields(fill_mode="solid"),
-            "world/arena/pillars": rr.Cylinders3D.from_fields(fill_mode="solid"),
-        },
-    )
-
-
-def _points(ear: str) -> rrb.View:
-    mapping = rrb.encodings.VisualizerComponentMapping(
-        "Points3D:colors",
-        rrb.encodings.ComponentSourceKind.SourceComponent,
-        source_component=f"{ear}_colors",
-    )
-    eye = rrb.EyeControls3D(kind="orbital", position=(-0.9, 0.0, 0.9), look_target=(1.0, 0.0, 0.0), eye_up=(0, 0, 1))
-    return rrb.Spatial3DView(
-        name=f"Level at the {ear} ear (violet 20 dB to yellow 80 dB SPL, grey unheard)",
-        origin="world/bat",
-        contents="world/**",
-        eye_controls=eye,
-        line_grid=False,
-        overrides={"world/bat/points": rr.Points3D.from_fields().visualizer(mappings=[mapping])},
-    )
-
-
-def _waveform(ear: str) -> rrb.View:
-    return rrb.BarChartView(name=f"Echo, {ear} ear [Pa over ms]", origin=f"echo/{ear}/waveform", plot_legend=_HIDDEN)
-
-
-def _cochleagram(ear: str) -> rrb.View:
-    bounds = rrb.VisualBounds2D(x_range=(-19, 126), y_range=(-1, 49))
-    return rrb.Spatial2DView(name=f"Cochleagram, {ear} ear", origin=f"echo/{ear}/cochleagram", visual_bounds=bounds)
-
-
-def _frame(ear: str) -> rrb.View:
-    return rrb.BarChartView(name=f"Echo frame, {ear} ear [over ms]", origin=f"echo/{ear}/frame", plot_legend=_HIDDEN)
-
-
-def _state() -> rrb.View:
-    bounds = rrb.VisualBounds2D(x_range=(-4, 25), y_range=(-0.3, 7.0))
-    return rrb.Spatial2DView(name="State, as the network gets it", origin="policy/state", visual_bounds=bounds)
-
-
-_HIDDEN = rrb.PlotLegend(visible=False)
-_LEGEND = rrb.PlotLegend(rrb.Corner2D.LeftTop)
-
-
-def _plot(name: str, *paths: str) -> rrb.View:
-    return rrb.TimeSeriesView(name=name, origin="/", contents=list(paths), plot_legend=_LEGEND)
-
-
-def _q() -> rrb.View:
-    return _plot("Q values", "policy/q", "policy/chosen")
-
-
-def _value() -> rrb.View:
-    return _plot("Value V", "policy/value")
-
-
-def _advantage() -> rrb.View:
-    return _plot("Advantages A", "policy/advantage")
-
-
-def _reward() -> rrb.View:
-    return _plot("Reward by term", "reward/straight", "reward/near")
-
-
-def _return() -> rrb.View:
-    return _plot("Return", "reward/return")
-
-
-def _clearance() -> rrb.View:
-    return _plot("Clearance [m]", "sensor/clearance")
-
-
-def _progress() -> rrb.View:
-    return _plot("Progress and distance [m]", "odometry/progress", "odometry/distance")
-
-
-def _actions() -> rrb.View:
-    return rrb.StateTimelineView(name="Action", origin="policy/action")
-
-
-def _events() -> rrb.View:
-    return rrb.TextLogView(name="Events", origin="events")

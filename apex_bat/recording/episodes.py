@@ -17,7 +17,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from apex_bat.config import settings
-from apex_bat.recording import hearing, scene
+from apex_bat.recording import hearing, scene, stages
 from apex_bat.recording.blueprints import APPLICATION_ID, flight_blueprint
 from apex_bat.recording.columns import tensor_columns
 from apex_bat.recording.flight import ACTION_NAMES, Flight
@@ -26,6 +26,7 @@ from apex_bat.recording.series import ACTION_COLOURS, SERIES, SETTINGS_PATH
 from apex_bat.simulation.layout import Arena
 from apex_bat.simulation.sonar import Sonar
 
+ACTION_LETTERS = ("S", "L", "R")  # whole words are cut off in a lane
 BLOCK_STEPS = 100
 """Steps sent together: few enough that a file cut short keeps its first blocks, enough that sending is cheap."""
 
@@ -64,25 +65,6 @@ def write_flight(flight: Flight, arena: Arena, sonar: settings.Sonar, directions
         part.unlink(missing_ok=True)
 
 
-def prune(folder: Path, max_mb: float) -> list[Path]:
-    """Deletes recordings of a folder until the rest takes at most `max_mb` megabytes; returns what was deleted.
-
-    Training flights go before evaluation flights, and the oldest first; the newest recording always stays. Whoever
-    wants to keep one moves it to another folder.
-    """
-    ages = [(path, path.stat()) for path in folder.glob("*.rrd")]
-    ages.sort(key=lambda age: (age[0].name.startswith("evaluation"), age[1].st_mtime_ns, age[0].name))
-    newest = max((stat.st_mtime_ns for _, stat in ages), default=0)
-    excess = sum(stat.st_size for _, stat in ages) - max_mb * 1e6
-    deleted = []
-    for path, stat in ages:
-        if excess > 0 and stat.st_mtime_ns != newest:
-            path.unlink(missing_ok=True)
-            excess -= stat.st_size
-            deleted.append(path)
-    return deleted
-
-
 def _send_all(
     recording: rr.RecordingStream, flight: Flight, arena: Arena, sonar: settings.Sonar, directions: Directions
 ) -> None:
@@ -94,6 +76,7 @@ def _send_all(
     ear = Sonar(msgspec.structs.replace(sonar, rendering="thesis"))
     hearing.log_frame_styles(recording, flight.state.shape[1])
     _log_series_styles(recording)
+    recording.flush()  # what is logged is gathered and would come after what is sent, and be lost first in a kill
     for rows in _blocks(flight.num_steps):
         _send_block(recording, flight, rows)
         _send_heavy(recording, flight, rows, ear, directions)
@@ -136,9 +119,9 @@ def _send_heavy(recording: rr.RecordingStream, flight: Flight, rows: slice, ear:
     azimuth_rad, elevation_rad = (np.broadcast_to(angle, ranges_m.shape) for angle in directions)
     echo = ear.hear(azimuth_rad, elevation_rad, ranges_m, generator)
     if rows.start == 0:
-        hearing.log_stage_styles(recording, echo)
+        stages.log_stage_styles(recording, echo)
     hearing.send_points(recording, ranges_m, echo.level_db, directions, times)
-    hearing.send_stages(recording, echo, times)
+    stages.send_stages(recording, echo, times)
     recording.send_columns("sensor/ranges", times, tensor_columns("Tensor", ranges_m))
 
 
@@ -155,9 +138,15 @@ def _log_series_styles(recording: rr.RecordingStream) -> None:
                 colors=series.colours, names=series.names, markers=["circle"], marker_sizes=[2.5]
             )
         else:
-            style = rr.SeriesLines(colors=series.colours, names=series.names, widths=[1.5] * len(series.names))
+            style = rr.SeriesLines(
+                colors=series.colours,
+                names=series.names,
+                widths=[1.5] * len(series.names),
+                aggregation_policy="MinMax",  # their mean would show rewards that were never given
+                interpolation_mode="StepBefore" if series.field.startswith("reward_") else "Linear",
+            )
         recording.log(series.path, style, static=True)
-    actions = rr.StateConfiguration(values=ACTION_NAMES, labels=ACTION_NAMES, colors=ACTION_COLOURS)
+    actions = rr.StateConfiguration(values=ACTION_NAMES, labels=ACTION_LETTERS, colors=ACTION_COLOURS)
     recording.log("policy/action", actions, static=True)
 
 
@@ -170,6 +159,7 @@ def _send_properties(recording: rr.RecordingStream, flight: Flight) -> None:
         "kind": facts.kind,
         "seed": facts.seed,
         "episode": facts.episode,
+        "mark": facts.mark or None,
         "actor": facts.actor,
         "epsilon": facts.epsilon,
         "checkpoint_step": facts.checkpoint_step,
@@ -179,6 +169,9 @@ def _send_properties(recording: rr.RecordingStream, flight: Flight) -> None:
         "progress_m": float(flight.progress_m[-1]),
         "distance_m": float(flight.distance_m[-1]),
         "collided": bool(flight.contact.any()),
+        "start_x_m": float(flight.poses[0, 0]),
+        "start_y_m": float(flight.poses[0, 1]),
+        "start_heading_rad": float(flight.poses[0, 2]),
         "heavy_period_steps": flight.heavy_period_steps,
     }
     values: dict[str, Any] = {name: value for name, value in known.items() if value is not None}

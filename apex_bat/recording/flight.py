@@ -22,6 +22,7 @@ from apex_bat.config.settings import Recording as RecordingSettings
 from apex_bat.experience import NUM_ACTIONS, NUM_BINS, NUM_EARS
 
 Kind = Literal["training", "evaluation"]
+Mark = Literal["", "best", "worst", "crash"]
 
 ACTION_NAMES = ("straight", "left", "right")
 
@@ -46,6 +47,8 @@ class FlightFacts:
     """Share of random actions."""
     checkpoint_step: int | None = None
     """Learner step of the weights that flew first; None: unknown or untrained."""
+    mark: Mark = ""
+    """Why the flight is kept longer than others; found out after it."""
     body: Body = field(default_factory=Body)
     """The robot: its size, sensor height and the time between two calls."""
 
@@ -54,7 +57,8 @@ class FlightFacts:
         who = f"seed{self.seed}" if self.actor is None else f"actor{self.actor:03d}"
         weights = "" if self.checkpoint_step is None else f"-step{self.checkpoint_step}"
         arena = re.sub(r"[^A-Za-z0-9_]+", "_", PureWindowsPath(self.arena.removesuffix(".toml")).name)
-        return f"{self.kind}-{arena}-{self.condition}{weights}-{who}-{self.episode:06d}.rrd"
+        mark = f"-{self.mark}" if self.mark else ""
+        return f"{self.kind}-{arena}-{self.condition}{weights}-{who}-{self.episode:06d}{mark}.rrd"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,4 +1,4 @@
-"""A flight as a picture for papers and READMEs: the arena from above, and beside it what the bat heard and did.
+"""A flight as a picture or a film for papers and READMEs: the arena from above, what the bat heard and what it did.
 
 Drawn by matplotlib without any viewer or display. Colours grow lighter with time and with loudness, so that the picture
 reads in grey and for the colour-blind.
@@ -6,28 +6,35 @@ reads in grey and for the colour-blind.
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from apex_bat.experience import NUM_BINS
-from apex_bat.recording.flight import ACTION_NAMES, Flight
-from apex_bat.recording.outlines import arena_extent_m, model_triangles_m, wall_corners_m
-from apex_bat.recording.series import ACTION_COLOURS, EAR_NAMES, RED
+from apex_bat.recording.flight import Flight
+from apex_bat.recording.panels import MapPanel, TimePanel
 from apex_bat.simulation.layout import Arena
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.image import AxesImage
 
+SIZE_INCHES = (12.0, 5.2)
 DPI = 160
-BIN_MS = 1.0  # a value of an echo frame stands for 1 ms of delay
-WALL_SHADE = "0.35"
-TIME_MAP = "viridis"
-TIME_MAP_SHARE = 0.88  # its last, yellow end is too faint on white paper
-LOUD_MAP = "magma"
+FILM_DPI = 80  # 960 x 416 pixels
+GIF_IMAGES = 100
+GIF_IMAGES_PER_S = 10
+MP4_IMAGES_PER_S = 20
+LAST_IMAGE_S = 2.0
+"""How long a film rests on its last image."""
+_FFMPEG_TIMEOUT_S = 600.0
+
+
+class FilmError(RuntimeError):
+    """A film that cannot be made here."""
 
 
 def draw_flight(flight: Flight, arena: Arena, path: Path, *, until_step: int | None = None) -> None:
@@ -39,148 +46,86 @@ def draw_flight(flight: Flight, arena: Arena, path: Path, *, until_step: int | N
         path: the file to write.
         until_step: draw only what happened before this step, as in a film; None: everything.
     """
-    from matplotlib.figure import Figure
-
-    num_steps = flight.num_steps if until_step is None else min(max(until_step, 1), flight.num_steps)
-    figure = Figure(figsize=(12.0, 5.2), dpi=DPI, layout="constrained")
-    grid = figure.add_gridspec(4, 2, width_ratios=[1.0, 1.5], height_ratios=[4, 4, 0.5, 2.2])
-    _draw_map(figure, figure.add_subplot(grid[:, 0]), flight, arena, num_steps)
-    left = figure.add_subplot(grid[0, 1])
-    right, actions, clearance = (figure.add_subplot(grid[row, 1], sharex=left) for row in (1, 2, 3))
-    loudest = float(np.quantile(flight.frame, 0.998)) or 1.0
-    images = [_draw_strip(axes, flight, ear, num_steps, loudest) for ear, axes in enumerate((left, right))]
-    bar = figure.colorbar(images[0], ax=[left, right], pad=0.01, aspect=22)
-    bar.set_label("cochlea output")
-    _draw_actions(actions, flight, num_steps)
-    _draw_clearance(clearance, flight, num_steps)
-    for axes in (left, right, actions):
-        axes.tick_params(labelbottom=False)
-    left.set_title("Echoes heard at each call, and what the bat did", loc="left", fontsize=10)
-    figure.savefig(path)
+    drawing = _Drawing(flight, arena, DPI)
+    drawing.show(flight.num_steps if until_step is None else until_step)
+    drawing.figure.savefig(path)
 
 
-def _draw_map(figure: Figure, axes: Axes, flight: Flight, arena: Arena, num_steps: int) -> None:
-    """The arena from above, the trail coloured by time, start, contacts and a scale."""
-    from matplotlib import colormaps
-    from matplotlib.collections import LineCollection, PolyCollection
-    from matplotlib.colors import LinearSegmentedColormap
-    from matplotlib.patches import Circle
+def write_gif(flight: Flight, arena: Arena, path: Path) -> None:
+    """Writes a film of a flight as an animated GIF of at most 100 images, ten a second."""
+    from PIL import Image
 
-    axes.add_collection(PolyCollection([wall_corners_m(wall) for wall in arena.walls], facecolors=WALL_SHADE))
-    axes.add_collection(PolyCollection(list(model_triangles_m(arena)[..., :2]), facecolors=WALL_SHADE))
-    for pillar in arena.pillars:
-        axes.add_patch(Circle((pillar.x_m, pillar.y_m), pillar.radius_m, color=WALL_SHADE))
-    shades = colormaps[TIME_MAP](np.linspace(0.0, TIME_MAP_SHARE, 256))
-    places = flight.poses[: num_steps + 1, :2]
-    trail = LineCollection(
-        list(np.stack([places[:-1], places[1:]], axis=1)),
-        cmap=LinearSegmentedColormap.from_list("time", shades),
-        linewidths=1.6,
-        capstyle="round",
-    )
-    trail.set_array(flight.times_s[:num_steps])
-    trail.set_clim(0.0, flight.times_s[-1])
-    axes.add_collection(trail)
-    _draw_marks(axes, flight, num_steps)
-    extent = arena_extent_m(arena)
-    axes.set_xlim(extent.x_min - 0.2, extent.x_max + 0.2)
-    axes.set_ylim(extent.y_min - 0.14 * (extent.y_max - extent.y_min), extent.y_max + 0.1)
-    axes.set_aspect("equal")
-    axes.set_axis_off()
-    axes.set_title(_title(flight), loc="left", fontsize=10)
-    _draw_scale(axes, extent.x_min, extent.y_min - 0.07 * (extent.y_max - extent.y_min))
-    figure.colorbar(trail, cax=axes.inset_axes((0.45, 0.045, 0.5, 0.02)), orientation="horizontal", label="time [s]")
+    images = [Image.fromarray(image) for image in _images(flight, arena, GIF_IMAGES)]
+    # One palette for all, from the last image, which has every colour: else they flicker.
+    palette = images[-1].quantize(255)
+    indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    durations_ms = [1000 // GIF_IMAGES_PER_S] * (len(indexed) - 1) + [round(1000 * LAST_IMAGE_S)]
+    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=durations_ms, loop=0, optimize=True)
 
 
-def _draw_marks(axes: Axes, flight: Flight, num_steps: int) -> None:
-    """Start, contacts, and the bat itself where it is last seen."""
-    from matplotlib.patches import Circle
-    from matplotlib.patheffects import withStroke
+def write_mp4(flight: Flight, arena: Arena, path: Path) -> None:
+    """Writes a film of a flight as H.264 in real time, an image for each call, with the program ffmpeg.
 
-    halo = [withStroke(linewidth=3, foreground="white")]
-    radius_m = flight.facts.body.diameter_m / 2
-    x, y, heading = flight.poses[0]
-    axes.plot(
-        x, y, marker=(3, 0, np.degrees(heading) - 90), markersize=10, color="white", markeredgecolor="black", zorder=5
-    )
-    axes.annotate("start", (x, y), xytext=(8, 6), textcoords="offset points", fontsize=9, zorder=6, path_effects=halo)
-    x, y, heading = flight.poses[num_steps]
-    axes.add_patch(Circle((x, y), radius_m, facecolor="white", edgecolor="black", zorder=4))
-    axes.plot([x, x + radius_m * np.cos(heading)], [y, y + radius_m * np.sin(heading)], color="black", zorder=4)
-    places = flight.poses[1 : num_steps + 1][flight.contact[:num_steps]]
-    axes.plot(places[:, 0], places[:, 1], "X", color=_unit(RED), markersize=11, markeredgecolor="white", zorder=6)
-    for x, y, _ in places[:1]:
-        axes.annotate(
-            "contact", (x, y), xytext=(8, -12), textcoords="offset points", fontsize=9, zorder=6, path_effects=halo
+    Raises:
+        FilmError: there is no ffmpeg, or it fails.
+    """
+    program = shutil.which("ffmpeg")
+    if program is None:
+        raise FilmError(f"{path}: an mp4 needs the program ffmpeg, which is not installed; --gif does without")
+    images = list(_images(flight, arena, flight.num_steps))
+    images += images[-1:] * round(LAST_IMAGE_S * MP4_IMAGES_PER_S)
+    height, width = images[0].shape[:2]
+    command = [
+        program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
+        "-r", str(MP4_IMAGES_PER_S), "-i", "-", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path),
+    ]  # fmt: skip
+    raw = b"".join(image.tobytes() for image in images)
+    run = subprocess.run(command, input=raw, capture_output=True, timeout=_FFMPEG_TIMEOUT_S, check=False)  # noqa: S603
+    if run.returncode != 0:
+        raise FilmError(f"{path}: ffmpeg failed: {run.stderr.decode(errors='replace').strip()}")
+
+
+def _images(flight: Flight, arena: Arena, most: int) -> Iterator[NDArray[np.uint8]]:
+    """uint8 (height, width, 3): at most so many images, evenly spaced over the steps, the last one the whole flight."""
+    drawing = _Drawing(flight, arena, FILM_DPI)
+    for step in np.linspace(1, flight.num_steps, min(most, flight.num_steps)).round().astype(int).tolist():
+        drawing.show(step)
+        yield drawing.pixels()
+
+
+class _Drawing:
+    """The figure of a flight."""
+
+    def __init__(self, flight: Flight, arena: Arena, dpi: int) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        self.figure: Figure = Figure(figsize=SIZE_INCHES, dpi=dpi, layout="constrained")
+        self._canvas: Any = FigureCanvasAgg(self.figure)  # much of it is not typed
+        self._still: Any = None
+        self._num_steps = flight.num_steps
+        grid = self.figure.add_gridspec(4, 2, width_ratios=[1.0, 1.5], height_ratios=[4, 4, 0.5, 2.2])
+        left = self.figure.add_subplot(grid[0, 1])
+        others = [self.figure.add_subplot(grid[row, 1], sharex=left) for row in (1, 2, 3)]
+        self._panels = (
+            MapPanel(self.figure.add_subplot(grid[:, 0]), flight, arena),
+            TimePanel(left, others[0], others[1], others[2], flight),
         )
 
+    def show(self, step: int) -> None:
+        """Shows what happened before a step."""
+        for panel in self._panels:
+            panel.show(min(max(step, 1), self._num_steps))
 
-def _draw_scale(axes: Axes, x_m: float, y_m: float) -> None:
-    axes.plot([x_m, x_m + 1.0], [y_m, y_m], color="black", linewidth=3, solid_capstyle="butt")
-    axes.text(x_m + 0.5, y_m - 0.08, "1 m", ha="center", va="top", fontsize=9)
-
-
-def _draw_strip(axes: Axes, flight: Flight, ear: int, num_steps: int, loudest: float) -> AxesImage:
-    """The echo frames of one ear over time, early echoes at the bottom."""
-    shown = np.full((flight.num_steps, NUM_BINS), np.nan, np.float32)
-    shown[:num_steps] = flight.frame[:num_steps, ear]
-    extent = (0.0, float(flight.times_s[-1]), 0.0, NUM_BINS * BIN_MS)
-    image = axes.imshow(
-        shown.T,
-        origin="lower",
-        aspect="auto",
-        extent=extent,
-        cmap=LOUD_MAP,
-        vmin=0.0,
-        vmax=loudest,
-        interpolation="nearest",
-    )
-    axes.set_ylabel(f"{EAR_NAMES[ear]} ear\ndelay [ms]")
-    axes.set_yticks([0, 6, 12, 18, 24])
-    return image
-
-
-def _draw_actions(axes: Axes, flight: Flight, num_steps: int) -> None:
-    """The chosen actions as a lane of colours."""
-    from matplotlib.colors import ListedColormap
-    from matplotlib.patches import Patch
-
-    palette = [_unit(colour) for colour in ACTION_COLOURS]
-    extent = (0.0, float(flight.times_s[num_steps]), 0.0, 1.0)
-    lane = flight.action[None, :num_steps]
-    axes.imshow(
-        lane, aspect="auto", extent=extent, cmap=ListedColormap(palette), vmin=0, vmax=2, interpolation="nearest"
-    )
-    axes.set_yticks([])
-    axes.set_ylabel("action", rotation=0, ha="right", va="center")
-    keys = [Patch(color=colour, label=name) for colour, name in zip(palette, ACTION_NAMES, strict=True)]
-    legend = axes.legend(
-        handles=keys, loc="upper left", bbox_to_anchor=(1.0, 1.5), frameon=False, fontsize=8, handlelength=1
-    )
-    legend.set_in_layout(False)
-
-
-def _draw_clearance(axes: Axes, flight: Flight, num_steps: int) -> None:
-    times_s, clearance_m = flight.times_s[1 : num_steps + 1], flight.clearance_m[:num_steps]
-    axes.plot(times_s, clearance_m, color="0.2", linewidth=1.0)
-    axes.axhline(flight.facts.body.diameter_m / 2, color=_unit(RED), linewidth=1.0, linestyle="--")
-    axes.annotate(
-        "contact", (0.0, flight.facts.body.diameter_m / 2), xytext=(3, 2), textcoords="offset points", fontsize=8
-    )
-    axes.set_ylim(0.0, float(flight.clearance_m.max()) * 1.1)
-    axes.set_ylabel("clearance\n[m]")
-    axes.set_xlabel("time [s]")
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _title(flight: Flight) -> str:
-    facts = flight.facts
-    ends = {"time": "to the time limit", "contact": "until contact", "": "broken off"}
-    end = ends.get(flight.end, f"until {flight.end}")
-    return f"{facts.condition} in {facts.arena}: {flight.num_steps} steps, {flight.distance_m[-1]:.0f} m, {end}"
-
-
-def _unit(colour: tuple[int, int, int]) -> tuple[float, float, float]:
-    """A colour with channels from 0 to 1, as matplotlib wants it."""
-    red, green, blue = (channel / 255 for channel in colour)
-    return red, green, blue
+    def pixels(self) -> NDArray[np.uint8]:
+        """Returns uint8 (height, width, 3); all but the first time, only what moves is drawn anew."""
+        moving = [artist for panel in self._panels for artist in panel.moving]
+        if self._still is None:
+            for artist in moving:
+                artist.set_animated(True)
+            self._canvas.draw()
+            self._still = self._canvas.copy_from_bbox(self.figure.bbox)
+        self._canvas.restore_region(self._still)
+        for artist in moving:
+            artist.draw(self._canvas.get_renderer())
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()

@@ -81,6 +81,35 @@ def read_settings(path: Path) -> RecordedSettings:
     return _settings(path, _read_chunks(path))
 
 
+def read_properties(path: Path) -> Mapping[str, Any]:
+    """Returns what a recording says of the flight as a whole, without reading the rest where it has an index.
+
+    Raises:
+        RecordingError: names the file and what is wrong with it.
+    """
+    return _properties(path, _read_chunks(path, "/__properties/**"))
+
+
+def read_chunks(path: Path) -> list[Chunk]:
+    """Returns all that a recording holds, repaired first where needed.
+
+    Raises:
+        RecordingError: names the file and what is wrong with it.
+    """
+    return _read_chunks(path)
+
+
+def is_whole(path: Path) -> bool:
+    """Says whether a recording was closed properly: whether it has its index, which the viewer wants."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            RrdReader(path).store()
+        except (RuntimeError, ValueError):
+            return False
+    return True
+
+
 def repair_recording(path: Path, repaired: Path) -> None:
     """Writes a copy of a recording that was cut short, with all that is whole in it and an index.
 
@@ -93,28 +122,28 @@ def repair_recording(path: Path, repaired: Path) -> None:
         raise RecordingError(f"{path}: cannot be repaired: {run.stderr.strip().splitlines()[-1:]}")
 
 
-def _read_chunks(path: Path) -> list[Chunk]:
-    """All chunks of a recording, in the order in which they were written, repaired first where needed."""
+def _read_chunks(path: Path, content: str | None = None) -> list[Chunk]:
+    """The chunks of some entities, in the order in which they were written, repaired first where needed."""
     if not path.is_file():
         raise RecordingError(f"{path}: no such recording")
     try:
         try:
-            return _stream(path)
+            return _stream(path, content)
         except RuntimeError:  # what rerun raises for a message that ends beyond the end of the file
             with tempfile.TemporaryDirectory() as folder:
                 repaired = Path(folder, "repaired.rrd")
                 repair_recording(path, repaired)
-                return _stream(repaired)
+                return _stream(repaired, content)
     except RecordingError:
         raise
     except (RuntimeError, ValueError) as error:
         raise RecordingError(f"{path}: not a rerun recording: {error}") from error
 
 
-def _stream(path: Path) -> list[Chunk]:
+def _stream(path: Path, content: str | None) -> list[Chunk]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # "no footer", which is just why the file is read in this way
-        return RrdReader(path).stream().to_chunks()
+        return RrdReader(path).stream().filter(content=content).to_chunks()
 
 
 def _column(chunks: list[Chunk], entity: str, name: str) -> pa.Array:

@@ -93,7 +93,7 @@ def send_contacts(recording: rr.RecordingStream, flight: Flight, times: list[rr.
     """Sends a mark wherever an action led into a wall; `times` are those of the contacts."""
     places = _raise(flight.poses[1:][flight.contact], flight.facts.body.sensor_height_m)
     if len(places):
-        marks = rr.Points3D(places[:1], labels=["contact"], radii=[0.12], colors=[RED], show_labels=True)
+        marks = rr.Points3D(places[:1], labels=["contact"], radii=[0.07], colors=[RED], show_labels=True)
         still = [
             batch for batch in marks.as_component_batches() if "positions" not in str(batch.component_descriptor())
         ]

@@ -1,4 +1,4 @@
-"""Recording of an actor's own episodes: every n-th of its first bat, as `recording.every_episodes` says."""
+"""Recording of an actor's own episodes: every n-th of one of its bats, as the settings `recording` say."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ from apex_bat.roles.plan import Assignment
 from apex_bat.simulation.vector import EchoFlightVector, Info, Observation
 
 _log = logging.getLogger(__name__)
-_BAT = 0
 
 
 class EpisodeRecorder:
-    """Follows the first bat of the first actor; other actors record nothing."""
+    """Follows the least exploring bat of an actor that `recording.actors` names; other actors record nothing."""
 
-    def __init__(self, assignment: Assignment, env: EchoFlightVector, epsilon: float) -> None:
-        self._assignment, self._env, self._epsilon = assignment, env, epsilon
-        every = assignment.config.recording.every_episodes
-        self._every = every if assignment.role.number == 0 else 0
+    def __init__(self, assignment: Assignment, env: EchoFlightVector, epsilons: NDArray[np.float64]) -> None:
+        """Takes the actor's part of the run, its bats, and how much each of them explores."""
+        self._assignment, self._env = assignment, env
+        self.bat = int(epsilons.argmin())
+        self._epsilon = float(epsilons[self.bat])
+        settings = assignment.config.recording
+        self._every = settings.every_episodes if assignment.role.number in settings.actors else 0
         self._episode = 0
         self._log: FlightLog | None = None
         self._row: dict[str, object] = {}
@@ -39,35 +41,36 @@ class EpisodeRecorder:
         )  # fmt: skip
         self._log = FlightLog(facts, config.state_steps, config.recording.heavy_period_steps)
 
-    def before(self, observation: Observation, values: PolicyValues, action: int) -> None:
+    def before(self, observation: Observation, values: PolicyValues, actions: NDArray[np.int64]) -> None:
         """Notes what the bat perceives and chooses."""
         if self._log is None:
             return
-        env = self._env
+        env, bat = self._env, self.bat
         self._row = {
-            "pose": env.poses[_BAT].copy(), "frame": env.newest_frames[_BAT].copy(),
-            "state": observation["echoes"][_BAT], "q": values.q[_BAT], "value": float(values.value[_BAT, 0]),
-            "advantage": values.advantage[_BAT], "action": action, "ranges_m": env.ranges_m[_BAT].copy(),
+            "pose": env.poses[bat].copy(), "frame": env.newest_frames[bat].copy(),
+            "state": observation["echoes"][bat], "q": values.q[bat], "value": float(values.value[bat, 0]),
+            "advantage": values.advantage[bat], "action": int(actions[bat]), "ranges_m": env.ranges_m[bat].copy(),
         }  # fmt: skip
 
-    def after(self, reward: float, info: Info) -> None:
+    def after(self, rewards: NDArray[np.float64], info: Info) -> None:
         """Notes what the action led to."""
         if self._log is None:
             return
         terms = ("reward_straight", "reward_near", "clearance_m", "progress_m", "distance_m")
-        row = self._row | {name: float(info[name][_BAT]) for name in terms}
-        self._log.append(**row, reward=reward, contact=bool(info["contact"][_BAT]))  # type: ignore[arg-type]
+        row = self._row | {name: float(info[name][self.bat]) for name in terms}
+        reward, contact = float(rewards[self.bat]), bool(info["contact"][self.bat])
+        self._log.append(**row, reward=reward, contact=contact)  # type: ignore[arg-type]
 
     def end(self, ended: NDArray[np.bool_], info: Info) -> None:
         """Writes the recording if the episode has ended."""
-        if not ended[_BAT]:
+        if not ended[self.bat]:
             return
         self._episode += 1
         if self._log is None:
             return
         from apex_bat.recording.keeping import keep_flights
 
-        flight = self._log.finish(self._env.poses[_BAT].copy(), str(info["end"][_BAT]))
+        flight = self._log.finish(self._env.poses[self.bat].copy(), str(info["end"][self.bat]))
         self._log = None
         try:
             keep_flights([flight], self._assignment.config, self._assignment.run, draw=False)

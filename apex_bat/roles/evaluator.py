@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
+from collections.abc import Mapping
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from apex_bat.agent.inference import Policy
 from apex_bat.evaluation.flights import fly, score
+from apex_bat.recording.flight import Flight
 from apex_bat.roles import checkpoint
 from apex_bat.roles.plan import Assignment
 from apex_bat.roles.reporting import RoleReporter
@@ -67,9 +73,11 @@ class Evaluator:
         self._judged = path
         self._policy.load(found.policy_parameters())
         config = self._config
-        records, _ = fly(
+        num_sampled = config.recording.sampled_flights
+        records, flights = fly(
             self._policy, config, config.arena, num_flights=config.evaluation.flights,
-            seed=config.evaluation.start_seed + 1, is_stopped=self._is_stopped,
+            seed=config.evaluation.start_seed + 1, num_recorded=num_sampled, checkpoint_step=found.learner_step,
+            is_stopped=self._is_stopped,
         )  # fmt: skip
         if not records:
             return
@@ -82,11 +90,33 @@ class Evaluator:
             ("progress_m", result[1]),
             ("steps", sum(record.steps for record in records) / len(records)),
             ("return", sum(record.reward for record in records) / len(records)),
+            *part_norms(found.policy_parameters()).items(),
         ):
             self._reporter.gauge(name, value)
         self._reporter.send(f"judged the checkpoint of update {found.learner_step}")
+        self._record(flights)
+
+    def _record(self, flights: list[Flight]) -> None:
+        """Records the sampled flights; on a full disk the evaluation counts all the same."""
+        if not flights:
+            return
+        from apex_bat.recording.keeping import keep_flights
+
+        try:
+            keep_flights(flights, self._config, self._assignment.run, draw=False)
+        except OSError as error:
+            _log.error("no recording: %s", error)
 
     def _is_stopped(self) -> bool:
         if self._reporter.is_due:
             self._reporter.send("flying")
         return self._assignment.stop.is_set()
+
+
+def part_norms(parameters: Mapping[str, NDArray[np.float32]]) -> dict[str, float]:
+    """Returns `weights_norm.PART` of each part of the network: the root of the sum of its squared parameters."""
+    squares: dict[str, float] = {}
+    for name, values in parameters.items():
+        part = f"weights_norm.{name.partition('.')[0]}"
+        squares[part] = squares.get(part, 0.0) + float(np.square(values, dtype=np.float64).sum())
+    return {part: math.sqrt(total) for part, total in squares.items()}

@@ -51,6 +51,9 @@ EVALUATOR_METRICS: dict[str, Metric] = {
     "progress_m": Metric("m", "mean net way along the corridor"),
     "steps": Metric("steps", "mean length of a flight"),
     "return": Metric("1", "mean undiscounted return"),
+    "weights_norm.filters": Metric("1", "Euclidean norm of the parameters of all convolutions of that checkpoint"),
+    "weights_norm.value": Metric("1", "the same of the value stream"),
+    "weights_norm.advantage": Metric("1", "the same of the advantage stream"),
 }
 
 DECLARED: dict[str, dict[str, Metric]] = {

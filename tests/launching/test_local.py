@@ -99,7 +99,8 @@ def test_a_whole_run_learns_evaluates_and_records(tmp_path: Path) -> None:
     final = json.loads((run / "evaluation" / "final.json").read_text())
     assert len(final["flights"]) == 2
     assert {flight["arena"] for flight in final["flights"]} == {"simple"}
-    assert len(list((run / "recordings").glob("*.rrd"))) == 1
+    assert list((run / "recordings").glob("evaluation-simple-memory-*-seed20200-*.rrd"))
+    assert (run / "recordings" / "training.rrd").exists()
     assert len(list((run / "figures").glob("*.png"))) == 1
     assert not (run / "sockets").exists()
     assert list((run / "metrics" / "tensorboard").iterdir())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,12 @@ import pytest
 from rerun.chunk import RrdReader
 
 from apex_bat.config import settings
-from apex_bat.recording.episodes import prune, write_flight
+from apex_bat.recording.episodes import write_flight
 from apex_bat.recording.flight import ACTION_NAMES, Flight
 from apex_bat.recording.hearing import Directions, level_colours
 from apex_bat.recording.series import RED, SERIES
+from apex_bat.recording.spectrogram import cochleagrams
+from apex_bat.recording.stages import STAGES
 from apex_bat.simulation.layout import Arena
 from apex_bat.simulation.sonar import Sonar
 
@@ -78,19 +79,36 @@ def test_frames_and_states_are_those_of_the_flight(recording: Path, flight: Flig
         np.testing.assert_array_equal(np.array(image[0], np.uint8).view(np.float32).reshape(state.shape), state)
 
 
-def test_waveforms_and_cochleagrams_are_those_of_the_sonar(
+def test_stages_of_the_ear_are_those_of_the_sonar(recording: Path, flight: Flight, directions: Directions) -> None:
+    assert flight.ranges_m is not None
+    echo = Sonar(rendering="thesis").hear(*directions, flight.ranges_m[3])
+    for stage in STAGES:
+        values = getattr(echo, stage.field)[:, :: stage.every]
+        for number, ear in enumerate(("left", "right")):
+            steps, bars = _entity(recording, f"echo/{ear}/{stage.name}", "BarChart:values")
+            assert steps == flight.heavy_steps.tolist()
+            np.testing.assert_allclose(bars[3][0]["buffer"], values[number], rtol=1e-3, atol=1e-7, err_msg=stage.name)
+        _, spans = _entity(recording, f"echo/scale/{stage.name}", "BarChart:values")
+        highest, lowest = max(0.0, values.max()), min(0.0, values.min())
+        np.testing.assert_allclose(spans[3][0]["buffer"], [highest, lowest], rtol=1e-3, err_msg=stage.name)
+
+
+def test_cochleagrams_have_the_highest_frequency_on_top(
     recording: Path, flight: Flight, directions: Directions
 ) -> None:
     assert flight.ranges_m is not None
-    echo = Sonar(rendering="thesis").hear(*directions, flight.ranges_m[3])
-    assert echo.pressure_pa is not None
+    pressure_pa = Sonar(rendering="thesis").hear(*directions, flight.ranges_m[3]).pressure_pa
+    assert pressure_pa is not None
+    heard = cochleagrams(pressure_pa, 125_000)
     for number, ear in enumerate(("left", "right")):
-        steps, bars = _entity(recording, f"echo/{ear}/waveform", "BarChart:values")
-        assert steps == flight.heavy_steps.tolist()
-        np.testing.assert_allclose(bars[3][0]["buffer"], echo.pressure_pa[number], rtol=1e-3, atol=1e-7)
         _, images = _entity(recording, f"echo/{ear}/cochleagram", "DepthImage:buffer")
-        upside = np.array(images[3][0], np.uint8).view(np.float16).reshape(echo.cochleagram.shape[1:])
-        np.testing.assert_allclose(upside[::-1], echo.cochleagram[number], rtol=1e-3, atol=1e-7)
+        upside = np.array(images[3][0], np.uint8).view(np.float16).reshape(heard.shape[1:])
+        np.testing.assert_allclose(upside[::-1], heard[number], rtol=1e-3, atol=1e-7)
+
+
+def test_frames_of_both_ears_share_a_scale(recording: Path, flight: Flight) -> None:
+    _, spans = _entity(recording, "echo/scale/frame", "BarChart:values")
+    np.testing.assert_array_equal([span[0]["buffer"][0] for span in spans], flight.frame.max(axis=(1, 2)))
 
 
 def test_points_are_where_the_rays_hit_and_coloured_by_level(
@@ -139,6 +157,8 @@ def test_properties_describe_the_flight(recording: Path) -> None:
     assert known["collided"] is True
     assert known["steps"] == 130
     assert "checkpoint_step" not in known
+    assert "mark" not in known
+    assert (known["start_x_m"], known["start_y_m"], known["start_heading_rad"]) == (-1.5, 0.0, 0.0)
 
 
 def test_recording_has_its_own_id_a_shared_application_and_a_layout(
@@ -184,18 +204,6 @@ def test_missing_folder_is_an_os_error_that_names_the_file(
 ) -> None:
     with pytest.raises(OSError, match=r"x\.rrd"):
         write_flight(fly(2), room, settings.Sonar(), directions, tmp_path / "nowhere" / "x.rrd")
-
-
-def test_prune_takes_training_flights_first_then_the_oldest_and_spares_the_newest(tmp_path: Path) -> None:
-    names = ["evaluation-1", "training-2", "training-3", "evaluation-4"]
-    for age, name in enumerate(names):
-        path = tmp_path / f"{name}.rrd"
-        path.write_bytes(bytes(1000))
-        os.utime(path, ns=(age, age))
-    assert prune(tmp_path, 0.004) == []
-    assert [path.stem for path in prune(tmp_path, 0.0025)] == ["training-2", "training-3"]
-    assert [path.stem for path in prune(tmp_path, 0.0)] == ["evaluation-1"]
-    assert [path.stem for path in tmp_path.iterdir()] == ["evaluation-4"]
 
 
 def _entity(path: Path, entity: str, component: str) -> tuple[list[int], list[Any]]:

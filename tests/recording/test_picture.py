@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from matplotlib import image
 from numpy.typing import NDArray
+from PIL import Image
 
 from apex_bat.recording.flight import Flight
-from apex_bat.recording.picture import draw_flight
+from apex_bat.recording.picture import FilmError, draw_flight, write_gif, write_mp4
 from apex_bat.recording.series import RED
 from apex_bat.simulation.layout import Arena
 
@@ -38,6 +41,27 @@ def test_picture_for_print_has_the_format_of_its_suffix(
 ) -> None:
     draw_flight(fly(5), room, tmp_path / "a.svg")
     assert b"<svg" in (tmp_path / "a.svg").read_bytes()[:1000]
+
+
+def test_film_moves_and_rests_at_its_end(fly: Callable[..., Flight], room: Arena, tmp_path: Path) -> None:
+    write_gif(fly(8), room, tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as film:
+        assert getattr(film, "n_frames", 1) == 8
+        durations_ms, images = [], []
+        for number in range(8):
+            film.seek(number)
+            durations_ms.append(film.info["duration"])
+            images.append(np.asarray(film.convert("RGB")))
+    assert durations_ms == [100] * 7 + [2000]
+    assert all((one != other).any() for one, other in itertools.pairwise(images))
+
+
+def test_mp4_without_ffmpeg_says_so(
+    fly: Callable[..., Flight], room: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(FilmError, match="needs the program ffmpeg"):
+        write_mp4(fly(2), room, tmp_path / "a.mp4")
 
 
 def _draw(flight: Flight, arena: Arena, path: Path, until_step: int | None = None) -> NDArray[np.float32]:

@@ -1,0 +1,46 @@
+"""The rows of a run: appended at once, and a full disk is an error, never a hang."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from apex_bat.recording.metrics import MetricsWriter
+from apex_bat.storage import StorageError
+from apex_bat.transport.messages import Report
+
+REPORT = Report("actor-0", 7, "here", "", "flying", {"env_steps": 5.0, "return": 0.25})
+
+
+def test_each_row_is_in_the_file_as_soon_as_it_is_appended(tmp_path: Path) -> None:
+    writer = MetricsWriter(tmp_path)
+    for number in (1, 2):
+        writer.append(REPORT, elapsed_s=1.5, env_steps=10, learner_step=3)
+        rows = [json.loads(line) for line in (tmp_path / "actor-0.jsonl").read_text().splitlines()]
+        assert len(rows) == number
+    assert rows[0]["return"] == 0.25
+    assert rows[0]["env_steps_total"] == 10
+    writer.close()
+
+
+def test_the_same_figures_are_tensorboard_events(tmp_path: Path) -> None:
+    writer = MetricsWriter(tmp_path)
+    writer.append(REPORT, elapsed_s=1.5, env_steps=10, learner_step=3)
+    events = next((tmp_path / "tensorboard").iterdir()).read_bytes()
+    assert b"actor-0/return" in events
+    assert b"actor-0/env_steps" in events
+    writer.close()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize("name", ["actor-0.jsonl", "tensorboard"])
+def test_a_full_disk_is_an_error_and_never_a_hang(name: str, tmp_path: Path) -> None:
+    with Path("/dev/full").open("wb", buffering=0) as full:
+        writer = MetricsWriter(tmp_path)
+        if name == "tensorboard":
+            writer._events._py_recordio_writer._writer = full
+        else:
+            (tmp_path / name).symlink_to("/dev/full")
+        with pytest.raises(StorageError, match="No space left"):
+            writer.append(REPORT, elapsed_s=1.5, env_steps=10, learner_step=3)
+        writer.close()

@@ -1,0 +1,54 @@
+"""The README's figures are those of the committed results."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+RESULT: dict[str, Any] = json.loads((ROOT / "docs" / "results" / "memory_simple.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("row", RESULT["summary"], ids=lambda row: row["arena"])
+def test_each_row_of_the_table_is_that_of_the_result(row: dict[str, Any]) -> None:
+    line = (
+        f"| {row['arena']} | {row['completed']} of {row['flights']} | {row['steps_mean']:.0f} "
+        f"| {row['distance_m_mean']:.1f} | {row['progress_m_mean']:.1f} | {100 * row['straight_share_mean']:.0f} |"
+    )
+    assert line in README
+
+
+def test_the_bat_of_the_readme_completes_fourteen_of_fifteen_in_simple() -> None:
+    simple = next(row for row in RESULT["summary"] if row["arena"] == "simple")
+    assert simple["flights"] == 15
+    assert simple["completed"] >= 14
+
+
+def test_seed_time_and_size_of_the_training_are_those_of_the_result() -> None:
+    training = RESULT["training"]
+    minutes, seconds = divmod(round(training["wall_s"]), 60)
+    text = " ".join(README.split())
+    assert f"seed {training['seed']}, {minutes} min {seconds} s" in text
+    assert f"{training['env_steps']:,} steps and {training['learner_steps']:,} updates" in text
+
+
+def test_pictures_of_the_readme_exist() -> None:
+    names = [part.partition(")")[0] for part in README.split("](")[1:] if part.partition(")")[0].endswith(".png")]
+    assert names
+    assert all((ROOT / name).is_file() for name in names)
+
+
+def test_rates_of_the_simulation_are_those_of_the_committed_benchmark() -> None:
+    records = json.loads((ROOT / "docs" / "results" / "bench_simulation.json").read_text(encoding="utf-8"))
+    median = {record["name"]: record["median"] for record in records}
+    for way in ("obvious", "single", "sixteen"):
+        assert f"| {median[f'simulation.{way}.steps_per_s']:.0f} |" in README
+    text = " ".join(README.split())
+    assert f"{median['simulation.ratio']:.0f} times the obvious way" in text
+    stages = {name: median[f"simulation.stage.{name}_us"] for name in ("ear", "rays", "world", "starts", "rest")}
+    assert (
+        f"the ear takes {stages['ear']:.0f}, rays {stages['rays']:.0f}, motion and contact {stages['world']:.0f}, "
+        f"new starts {stages['starts']:.0f} and the rest {stages['rest']:.0f}"
+    ) in text

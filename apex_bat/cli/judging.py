@@ -27,12 +27,12 @@ def evaluate(
     from apex_bat.cli.training import print_result
     from apex_bat.evaluation import runs
     from apex_bat.recording.keeping import keep_flights, num_logged
-    from apex_bat.simulation.arenas import load_arena
+    from apex_bat.simulation.arenas import load_arenas
 
     config = runs.load_config(run)
     chosen = [name.strip() for name in arenas.split(",") if name.strip()] or list(config.evaluation.arenas)
     for name in chosen:
-        load_arena(name)
+        load_arenas(name)
     result, recorded = runs.evaluate(
         run, chosen, flights or config.evaluation.flights,
         config.evaluation.start_seed if seed is None else seed, num_recorded=num_logged(config.recording, record),

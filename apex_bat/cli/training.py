@@ -80,12 +80,12 @@ def check(config: Config) -> None:
         ConfigError, ArenaError, TransportError: they name the setting.
     """
     from apex_bat.agent.inference import parameter_shapes
-    from apex_bat.simulation.arenas import load_arena
+    from apex_bat.simulation.arenas import load_arenas
     from apex_bat.transport.security import load_keys
     from apex_bat.transport.sockets import check_address
 
     for arena in dict.fromkeys((config.arena, *config.evaluation.arenas)):
-        load_arena(arena)
+        load_arenas(arena)
     try:
         parameter_shapes(config.network, config.state_steps)
     except ValueError as error:

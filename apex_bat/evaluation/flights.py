@@ -14,6 +14,7 @@ from apex_bat.agent.inference import PolicyValues
 from apex_bat.config import Config
 from apex_bat.experience import NUM_ACTIONS, States
 from apex_bat.recording.flight import Flight, FlightFacts, FlightLog
+from apex_bat.simulation.arenas import arena_names
 from apex_bat.simulation.vector import EchoFlightVector
 
 CLEARANCE_QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95)
@@ -24,6 +25,7 @@ class FlightRecord(Struct, frozen=True):
 
     condition: str
     arena: str
+    """Name of the one arena, also where several were asked for together."""
     seed: int
     """Seed of the start poses."""
     flight: int
@@ -94,7 +96,7 @@ def fly(
             if (terminated | truncated).any() and flying.any():
                 # The bats that have ended fly on uncounted, so that the others keep their places in the batch.
                 observation, _ = env.reset(options={"reset_mask": terminated | truncated})
-        return log.records(), sorted(log.flights, key=lambda flight: flight.facts.episode)
+        return log.records(), sorted(log.flights, key=lambda flight: (flight.facts.arena, flight.facts.episode))
     finally:
         env.close()
 
@@ -105,7 +107,8 @@ class _Log:
     def __init__(
         self, env: EchoFlightVector, config: Config, arena: str, seed: int, num_recorded: int, step: int | None
     ) -> None:
-        self._env, self._config, self._arena, self._seed = env, config, arena, seed
+        self._env, self._config, self._seed = env, config, seed
+        self._names, self._step, self._num_recorded = arena_names(arena), step, num_recorded
         n = env.num_envs
         self._steps = np.zeros(n, np.int64)
         self._rewards = np.zeros(n)
@@ -113,20 +116,23 @@ class _Log:
         self._clearance: list[list[float]] = [[] for _ in range(n)]
         self._last: list[dict[str, Any]] = [{} for _ in range(n)]
         self._chosen = np.zeros(n, np.int64)
-        self._logs = [
-            FlightLog(
-                FlightFacts(arena=arena, condition=config.condition, seed=seed, episode=i, checkpoint_step=step,
-                            body=config.body),
-                config.state_steps, config.recording.heavy_period_steps,
-            )
-            for i in range(min(num_recorded, n))
-        ]  # fmt: skip
+        self._logs: list[FlightLog] = []
         self._before: list[dict[str, Any]] = []
         self.flights: list[Flight] = []
 
     def begin(self) -> None:
         """Notes where the bats start."""
         self._starts = self._env.poses.copy()
+        self._arenas = [self._names[index] for index in self._env.colony.arena_index]
+        config = self._config
+        self._logs = [
+            FlightLog(
+                FlightFacts(arena=self._arenas[i], condition=config.condition, seed=self._seed, episode=i,
+                            checkpoint_step=self._step, body=config.body),
+                config.state_steps, config.recording.heavy_period_steps,
+            )
+            for i in range(min(self._num_recorded, len(self._starts)))
+        ]  # fmt: skip
 
     def before(
         self,
@@ -183,7 +189,7 @@ class _Log:
         shares = self._actions[i] / steps
         x_m, y_m, heading_rad = (float(value) for value in self._starts[i])
         return FlightRecord(
-            condition=self._config.condition, arena=self._arena, seed=self._seed, flight=i,
+            condition=self._config.condition, arena=self._arenas[i], seed=self._seed, flight=i,
             start=(x_m, y_m, heading_rad), steps=steps, completed=last["end"] == "time", collided=bool(last["contact"]),
             distance_m=float(last["distance_m"]), progress_m=abs(float(last["progress_m"])),
             reward=float(self._rewards[i]), action_shares=(float(shares[0]), float(shares[1]), float(shares[2])),

@@ -114,6 +114,7 @@ def evaluate(
     policy.load(found.policy_parameters())
     began_s = time.perf_counter()
     records: list[FlightRecord] = []
+    summaries: list[dict[str, Any]] = []
     flights: list[Flight] = []
     for arena in arenas:
         flown, recorded = fly(
@@ -121,6 +122,7 @@ def evaluate(
             checkpoint_step=found.learner_step,
         )  # fmt: skip
         records += flown
+        summaries.append(summary(flown, arena))
         flights += recorded
     result = {
         "run": folder.name,
@@ -130,7 +132,7 @@ def evaluate(
         "rendering": config.sonar.rendering,
         "training": training_facts(folder, config),
         "evaluation_wall_s": round(time.perf_counter() - began_s, 3),
-        "summary": [summary([record for record in records if record.arena == arena], arena) for arena in arenas],
+        "summary": summaries,
         "flights": [msgspec.to_builtins(record) for record in records],
     }
     return result, flights

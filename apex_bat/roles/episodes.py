@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from apex_bat.agent.inference import PolicyValues
 from apex_bat.recording.flight import FlightFacts, FlightLog
 from apex_bat.roles.plan import Assignment
+from apex_bat.simulation.arenas import arena_names
 from apex_bat.simulation.vector import EchoFlightVector, Info, Observation
 
 _log = logging.getLogger(__name__)
@@ -25,6 +26,7 @@ class EpisodeRecorder:
         self._epsilon = float(epsilons[self.bat])
         settings = assignment.config.recording
         self._every = settings.every_episodes if assignment.role.number in settings.actors else 0
+        self._names = arena_names(assignment.config.arena)
         self._episode = 0
         self._log: FlightLog | None = None
         self._row: dict[str, object] = {}
@@ -34,8 +36,9 @@ class EpisodeRecorder:
         if self._every == 0 or self._episode % self._every:
             return
         config = self._assignment.config
+        name = self._names[self._env.colony.arena_index[self.bat]]
         facts = FlightFacts(
-            arena=self._env.arena.name, condition=config.condition, kind="training", seed=config.seed,
+            arena=name, condition=config.condition, kind="training", seed=config.seed,
             episode=self._episode, actor=self._assignment.role.number, epsilon=self._epsilon,
             checkpoint_step=learner_step, body=config.body,
         )  # fmt: skip

@@ -18,7 +18,7 @@ from apex_bat.simulation.generated import FAMILIES, POOL_SIZE, generate_arena
 from apex_bat.simulation.layout import Arena, ArenaError, Model, Pillar, Wall
 from apex_bat.simulation.starts import start_region
 
-__all__ = ["Arena", "ArenaError", "Model", "Pillar", "Wall", "arena_folder", "load_arena", "load_arenas"]
+__all__ = ["Arena", "ArenaError", "Model", "Pillar", "Wall", "arena_folder", "arena_names", "load_arena", "load_arenas"]
 
 
 def load_arena(name: str | Path, *, body: Body | None = None, episode: Episode | None = None) -> Arena:
@@ -51,6 +51,16 @@ def load_arenas(names: str | Path, *, body: Body | None = None, episode: Episode
     for arena in arenas:
         start_region(arena, body or Body(), episode or Episode())
     return arenas
+
+
+def arena_names(names: str) -> tuple[str, ...]:
+    """Returns for each arena that a name stands for, in the order of `load_arenas`, a name that stands for it alone.
+
+    Raises:
+        ArenaError: as `load_arena`.
+    """
+    found = [(part.strip(), _resolve(part.strip())) for part in names.split(",")]
+    return tuple(part if len(arenas) == 1 else arena.name for part, arenas in found for arena in arenas)
 
 
 def arena_folder() -> Path:

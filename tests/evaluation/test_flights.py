@@ -1,6 +1,7 @@
 """Greedy flights: counted once, judged right, the same for equal seeds."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -10,6 +11,7 @@ from apex_bat.agent.inference import PolicyValues
 from apex_bat.config import Config, load
 from apex_bat.evaluation.flights import fly, score
 from apex_bat.experience import States
+from apex_bat.simulation.arenas import arena_folder
 
 CONFIG = load(None, ["episode.evaluation_steps=60", "sonar.rendering=exact"])
 
@@ -71,3 +73,18 @@ def test_records_are_plain_values_for_json() -> None:
     row = msgspec.json.decode(msgspec.json.encode(records[0]))
     assert row["arena"] == "simple"
     assert len(row["clearance_quantiles_m"]) == 6
+
+
+def test_flights_in_a_family_name_the_arena_of_each() -> None:
+    records, flights = fly(always(0), CONFIG, "corridor:0-3", num_flights=8, seed=1, num_recorded=8)
+    names = {record.arena for record in records}
+    assert len(names) > 1
+    assert names <= {f"corridor:{seed}" for seed in range(4)}
+    assert [flight.facts.arena for flight in flights] == sorted(record.arena for record in records)
+
+
+def test_flights_in_a_users_arena_name_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text((arena_folder() / "simple.toml").read_text())
+    records, flights = fly(always(0), CONFIG, str(path), num_flights=1, seed=1, num_recorded=1)
+    assert records[0].arena == flights[0].facts.arena == str(path)

@@ -84,6 +84,10 @@ def check(config: Config) -> None:
     from apex_bat.transport.security import load_keys
     from apex_bat.transport.sockets import check_address
 
+    if config.replay.shards > 1:
+        raise ConfigError(
+            f"replay.shards is {config.replay.shards}, and training starts one replay server: set it to 1"
+        )
     for arena in dict.fromkeys((config.arena, *config.evaluation.arenas)):
         load_arenas(arena)
     try:

@@ -28,6 +28,7 @@ def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         (["train", "--set", "network.strides=[20, 9]"], 2, "leave nothing of a row"),
         (["train", "--set", "transport.host=0.0.0.0"], 1, "not a loopback address, so it needs CURVE keys"),
         (["train", "--set", "transport.keys=nowhere"], 1, "nowhere"),
+        (["train", "--set", "replay.shards=2"], 2, "replay.shards is 2, and training starts one replay server"),
         (["train", "--nonsense"], 2, "No such option"),
         (["evaluate", "nowhere"], 1, "nowhere: no run here"),
         (["inspect", "nowhere"], 1, "nowhere"),

@@ -1,0 +1,58 @@
+"""The evaluator judges checkpoints, tells the norms of their weights, and records the flights that it is asked to."""
+
+from __future__ import annotations
+
+import math
+import threading
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from apex_bat.agent.d3qn import D3QN
+from apex_bat.config import load
+from apex_bat.recording.catalog import list_flights
+from apex_bat.roles import checkpoint
+from apex_bat.roles.checkpoint import Checkpoint
+from apex_bat.roles.evaluator import Evaluator, part_norms
+from apex_bat.roles.metrics import EVALUATOR_METRICS
+from apex_bat.roles.plan import Addresses, Assignment, Role
+
+SMALL = ("network.channels=[4]", "network.strides=[3]", "network.hidden=[8]", "sonar.rendering=exact",
+         "evaluation.flights=2", "episode.evaluation_steps=15")  # fmt: skip
+
+
+def test_norms_are_those_of_whole_parts() -> None:
+    parameters = {"value.0.weight": np.full((3, 3), 2.0, np.float32), "value.0.bias": np.array([8.0], np.float32)}
+    assert part_norms({**parameters, "filters.0.bias": np.zeros(2, np.float32)}) == {
+        "weights_norm.value": 10.0,
+        "weights_norm.filters": 0.0,
+    }
+
+
+def test_every_part_of_the_network_is_declared() -> None:
+    agent = D3QN(load(None, list(SMALL)), torch.device("cpu"))
+    norms = part_norms(agent.weights())
+    assert norms.keys() <= EVALUATOR_METRICS.keys()
+    assert all(math.isfinite(norm) and norm > 0.0 for norm in norms.values())
+
+
+@pytest.mark.parametrize("sampled", [0, 1])
+def test_as_many_flights_of_a_checkpoint_are_recorded_as_the_settings_say(sampled: int, tmp_path: Path) -> None:
+    config = load(None, [*SMALL, f"recording.sampled_flights={sampled}", "evaluation.period_s=0.001"])
+    agent = D3QN(config, torch.device("cpu"))
+    state = Checkpoint(7, checkpoint.fingerprint(config), {}, agent.arrays())
+    (tmp_path / "checkpoints").mkdir()
+    checkpoint.save(tmp_path / "checkpoints", state, keep=2)
+    addresses = Addresses(*(f"ipc://{tmp_path}/{name}" for name in ("replay", "weights", "reports")))
+    assignment = Assignment(Role("evaluator", 0), config, tmp_path, addresses, threading.Event(), 0)
+    with closing(Evaluator(assignment)) as evaluator:
+        while not (tmp_path / "checkpoints" / checkpoint.BEST).exists():
+            evaluator.step()
+    if sampled:
+        (entry,) = list_flights(tmp_path)
+        assert (entry.kind, entry.checkpoint_step, entry.seed) == ("evaluation", 7, config.evaluation.start_seed + 1)
+    else:
+        assert not (tmp_path / "recordings").exists()

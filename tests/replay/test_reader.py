@@ -158,7 +158,7 @@ def test_several_servers_give_items_that_find_their_way_back(
             seen |= set((batch.items % 2).tolist())
         assert seen == {0, 1}
         reader.update(np.array([2 * 7 + 1, 2 * 5]), np.array([3.0, 2.0], np.float32))
-        until(lambda: all(server.store.learner_step for server in servers), serve_both)
+        until(lambda: all(server.metrics()["replay.updated_priorities"] for server in servers), serve_both)
         stored = [server.store.buffer.item_arrays()["items"]["priority"] for server in servers]
         assert stored[1][7] == pytest.approx(3.0, abs=1e-4)
         assert stored[0][5] == pytest.approx(2.0, abs=1e-4)

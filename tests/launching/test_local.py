@@ -27,7 +27,14 @@ def start(run: Path, **changes: str) -> subprocess.Popen[str]:
     settings = SMALL | {name.replace("__", "."): value for name, value in changes.items()}
     overrides = [argument for name, value in settings.items() for argument in ("--set", f"{name}={value}")]
     command = [sys.executable, "-m", "apex_bat", "train", "--run", str(run), *overrides]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, preexec_fn=_hear_ctrl_c
+    )
+
+
+def _hear_ctrl_c() -> None:
+    """Makes SIGINT heard where the tests run in the background, which makes their children ignore it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def rows(run: Path, role: str) -> list[dict[str, Any]]:

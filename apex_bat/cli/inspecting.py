@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable, Sequence
 from enum import StrEnum
@@ -76,7 +77,8 @@ def inspect(
     if live:
         from apex_bat.recording.streaming import stream_run
 
-        stream_run(runs[0], port, leash=leash)
+        if not stream_run(runs[0], port, leash=leash):
+            os._exit(0)
         return
     from apex_bat.recording.catalog import choose_flight, list_flights
 

@@ -14,8 +14,9 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -32,21 +33,27 @@ HOST = "127.0.0.1"
 PORT = 9876
 """Where a rerun viewer listens unless told otherwise."""
 PERIOD_S = 2.0
-FLUSH_TIMEOUT_S = 20.0
-"""A viewer that has not taken what it was sent after this long counts as closed."""
+STEP_TIMEOUT_S = 30.0
+"""A viewer that has not taken what it was sent after this long is given up."""
+RETRY_S = 300.0
+"""How long it is left alone then."""
 _CONNECT_TIMEOUT_S = 0.5
 _NICENESS = 10  # training comes first
 _STOP_TIMEOUT_S = 3.0
 _log = logging.getLogger(__name__)
 
 
-def stream_run(run: Path, port: int = PORT, *, leash: bool = False) -> None:
+def stream_run(run: Path, port: int = PORT, *, leash: bool = False) -> bool:
     """Streams a run until it ends; waits for a viewer as long as there is none.
 
     Args:
         run: the run folder.
         port: of the viewer, on this machine.
         leash: end also when standard input ends, and leave the processor to others.
+
+    Returns:
+        Whether all threads ended; if not, one hangs within rerun on a viewer that takes nothing, which would also hold
+        up the end of the process: leave it by `os._exit`.
 
     Raises:
         ConfigError: the folder holds no run whose settings can be read.
@@ -56,14 +63,15 @@ def stream_run(run: Path, port: int = PORT, *, leash: bool = False) -> None:
         if hasattr(os, "nice"):
             os.nice(_NICENESS)
         threading.Thread(target=_wait_for_end_of_input, args=(stop,), daemon=True).start()
-    stream = RunStream(run, port)
+    stream, hangs, due_s = RunStream(run, port), False, 0.0
     while True:
         is_last = stop.is_set() or not _is_running(run)
-        stream.step()
+        if time.monotonic() >= due_s and not _ends_in_time(stream.step):
+            _log.warning("the viewer takes nothing; it is left alone for %g s", RETRY_S)
+            stream, hangs, due_s = RunStream(run, port), True, time.monotonic() + RETRY_S
         if is_last:
-            break
+            return _ends_in_time(stream.close) and not hangs
         stop.wait(PERIOD_S)
-    stream.close()
 
 
 @contextmanager
@@ -125,7 +133,7 @@ class RunStream:
             for row in self._new_rows():
                 self._curves.take(row)
             self._curves.flush()
-            self._training.flush(timeout_sec=FLUSH_TIMEOUT_S)
+            self._training.flush(timeout_sec=STEP_TIMEOUT_S)
 
     def _new_rows(self) -> Iterator[dict[str, Any]]:
         for path in sorted((self._run / "metrics").glob("*.jsonl")):
@@ -152,7 +160,7 @@ class RunStream:
         except (RecordingError, OSError) as error:  # deleted meanwhile, for want of room
             _log.warning("not sent: %s", error)
             return
-        flight.flush(timeout_sec=FLUSH_TIMEOUT_S)
+        flight.flush(timeout_sec=STEP_TIMEOUT_S)
         flight.disconnect()
         self._sent = newest
 
@@ -162,6 +170,14 @@ class RunStream:
                 self._training.disconnect()
         self._training = self._curves = self._sent = None
         self._offsets.clear()
+
+
+def _ends_in_time(work: Callable[[], None]) -> bool:
+    """Whether some work on the viewer ends in time; if not, it is left behind in a thread: rerun waits for ever."""
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    thread.join(STEP_TIMEOUT_S)
+    return not thread.is_alive()
 
 
 def _is_listening(port: int) -> bool:

@@ -115,6 +115,7 @@ def _send_heavy(recording: rr.RecordingStream, flight: Flight, rows: slice, ear:
     if flight.ranges_m is None or not chosen.any():
         return
     times, ranges_m = _times(flight, steps[chosen]), flight.ranges_m[chosen]
+    recording.send_columns("sensor/ranges", times, tensor_columns("Tensor", ranges_m))  # all else follows from them
     generator = np.random.default_rng([flight.facts.seed, rows.start])
     azimuth_rad, elevation_rad = (np.broadcast_to(angle, ranges_m.shape) for angle in directions)
     echo = ear.hear(azimuth_rad, elevation_rad, ranges_m, generator)
@@ -122,7 +123,6 @@ def _send_heavy(recording: rr.RecordingStream, flight: Flight, rows: slice, ear:
         stages.log_stage_styles(recording, echo)
     hearing.send_points(recording, ranges_m, echo.level_db, directions, times)
     stages.send_stages(recording, echo, times)
-    recording.send_columns("sensor/ranges", times, tensor_columns("Tensor", ranges_m))
 
 
 def _times(flight: Flight, steps: NDArray[np.int64]) -> list[rr.TimeColumn]:

@@ -87,7 +87,7 @@ class Views:
             kind="orbital", position=(-1.1, 0.0, 1.0), look_target=(1.0, 0.0, 0.0), eye_up=(0, 0, 1)
         )
         return rrb.Spatial3DView(
-            name=self._name(f"Level at the {ear} ear (violet 20 to yellow 80 dB SPL, grey unheard)"),
+            name=self._name(f"Level at the {ear} ear (violet 20, yellow 80 dB)"),
             origin=self._path("world/bat"),
             contents=self._path("world/**"),
             eye_controls=eye,

@@ -38,10 +38,11 @@ def test_settings_come_back(recording: Path, room: Arena) -> None:
 
 
 def test_file_cut_short_gives_its_whole_steps_as_a_broken_off_flight(
-    recording: Path, flight: Flight, tmp_path: Path
+    fly: Callable[..., Flight], room: Arena, directions: Directions, tmp_path: Path
 ) -> None:
-    cut = tmp_path / "cut.rrd"
-    cut.write_bytes(recording.read_bytes()[: -recording.stat().st_size // 4])
+    flight, cut = fly(400), tmp_path / "cut.rrd"
+    write_flight(flight, room, settings.Sonar(), directions, cut)
+    cut.write_bytes(cut.read_bytes()[: cut.stat().st_size // 2])
     part = read_flight(cut)
     assert 0 < part.num_steps < flight.num_steps
     assert part.end == ""

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +32,6 @@ GIF_IMAGES_PER_S = 10
 MP4_IMAGES_PER_S = 20
 LAST_IMAGE_S = 2.0
 """How long a film rests on its last image."""
-_FFMPEG_TIMEOUT_S = 600.0
 
 
 class FilmError(RuntimeError):
@@ -72,17 +73,30 @@ def write_mp4(flight: Flight, arena: Arena, path: Path) -> None:
     program = shutil.which("ffmpeg")
     if program is None:
         raise FilmError(f"{path}: an mp4 needs the program ffmpeg, which is not installed; --gif does without")
-    images = list(_images(flight, arena, flight.num_steps))
-    images += images[-1:] * round(LAST_IMAGE_S * MP4_IMAGES_PER_S)
-    height, width = images[0].shape[:2]
+    height, width = round(SIZE_INCHES[1] * FILM_DPI), round(SIZE_INCHES[0] * FILM_DPI)
     command = [
         program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
         "-r", str(MP4_IMAGES_PER_S), "-i", "-", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path),
     ]  # fmt: skip
-    raw = b"".join(image.tobytes() for image in images)
-    run = subprocess.run(command, input=raw, capture_output=True, timeout=_FFMPEG_TIMEOUT_S, check=False)  # noqa: S603
-    if run.returncode != 0:
-        raise FilmError(f"{path}: ffmpeg failed: {run.stderr.decode(errors='replace').strip()}")
+    with tempfile.TemporaryFile() as log:
+        with (
+            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log) as ffmpeg,  # noqa: S603  # our own
+            suppress(BrokenPipeError),  # it has failed, and says why in its log
+        ):
+            _feed(ffmpeg, _images(flight, arena, flight.num_steps))
+        if ffmpeg.returncode != 0:
+            log.seek(0)
+            raise FilmError(f"{path}: ffmpeg failed: {log.read().decode(errors='replace').strip()}")
+
+
+def _feed(ffmpeg: subprocess.Popen[bytes], images: Iterator[NDArray[np.uint8]]) -> None:
+    """Hands one image after the other to ffmpeg, the last one for as long as the film rests."""
+    assert ffmpeg.stdin is not None  # noqa: S101
+    with ffmpeg.stdin as film:
+        for image in images:
+            film.write(image.tobytes())
+        for _ in range(round(LAST_IMAGE_S * MP4_IMAGES_PER_S)):
+            film.write(image.tobytes())
 
 
 def _images(flight: Flight, arena: Arena, most: int) -> Iterator[NDArray[np.uint8]]:

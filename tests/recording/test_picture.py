@@ -64,6 +64,20 @@ def test_mp4_without_ffmpeg_says_so(
         write_mp4(fly(2), room, tmp_path / "a.mp4")
 
 
+def test_mp4_gets_every_image_and_the_word_of_a_failing_ffmpeg(
+    fly: Callable[..., Flight], room: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "ffmpeg"
+    program.write_text(f"#!/bin/sh\n/usr/bin/env -i /bin/cat > '{tmp_path}/raw'\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    write_mp4(fly(3), room, tmp_path / "a.mp4")
+    assert (tmp_path / "raw").stat().st_size == (3 + 40) * 960 * 416 * 3
+    program.write_text("#!/bin/sh\necho no such codec >&2\nexit 1\n")
+    with pytest.raises(FilmError, match="no such codec"):
+        write_mp4(fly(3), room, tmp_path / "a.mp4")
+
+
 def _draw(flight: Flight, arena: Arena, path: Path, until_step: int | None = None) -> NDArray[np.float32]:
     draw_flight(flight, arena, path, until_step=until_step)
     return np.asarray(image.imread(path), np.float32)

@@ -1,4 +1,4 @@
-"""Times of the replay core, in process, in microseconds of CPU: inserts of 50, samples and updates of 512.
+"""Times of the replay core, in process, in microseconds of CPU, beside cpprb's where that is installed.
 
 Run it with `apex-bat bench replay` or `python -m benchmarks.replay`.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from apex_bat.replay.heap import keep_freed_memory
 
 CAPACITIES = (50_000, 1_000_000)
 BATCHES = (32, 512)
+INSERT = 50  # transitions at once
 ROWS_EACH = 1.232  # of a transition, as the store reserves them for chunks of 50
 RUNS = 200
 
@@ -65,48 +66,62 @@ def synthetic_chunk(generator: np.random.Generator, transitions: int = 50) -> Ch
 
 
 def _of_capacity(capacity: int) -> list[Record]:
-    generator = np.random.default_rng(0)
-    buffer = ReplayBuffer(capacity, int(capacity * ROWS_EACH), memory_steps=3, heard_steps=3, alpha=0.6)
-    chunk = synthetic_chunk(generator)
-    priorities = chunk.priorities + np.float32(0.001)
-
-    def insert() -> None:
-        buffer.add([chunk], priorities, 0, 0)
-
-    for _ in range(capacity // 50 + 1):
-        insert()
     end = f"cap_{capacity}"
-    records = [summary(f"replay.insert_50.{end}.cpu_us", "us", _cpu_us(insert))]
-    for size in BATCHES:
-        items = buffer.sample(size, 0.4, generator).batch.items
-        errors = generator.random(size, dtype=np.float32) + np.float32(0.001)
-        sampled = _cpu_us(lambda size=size: buffer.sample(size, 0.4, generator))  # type: ignore[misc]
-        updated = _cpu_us(lambda items=items, errors=errors: buffer.update(items, errors))  # type: ignore[misc]
-        records.append(summary(f"replay.sample_{size}.{end}.cpu_us", "us", sampled))
-        records.append(summary(f"replay.update_{size}.{end}.cpu_us", "us", updated))
-    ratio = _ratio_to_cpprb(capacity, lambda: buffer.sample(512, 0.4, generator))
-    if ratio is not None:
-        records.append(summary(f"replay.sample_512.{end}.ratio_to_cpprb", "1", ratio))
-    records.append(summary(f"replay.resident_mb.{end}", "MB", [buffer.nbytes / 1e6]))
+    ours, theirs = _Ours(capacity), _cpprb(capacity)
+    records: list[Record] = []
+    for name, size in (("insert", INSERT), *((name, size) for size in BATCHES for name in ("sample", "update"))):
+        operations = [getattr(ours, name)(size)]
+        if theirs is not None:
+            operations.append(getattr(theirs, name)(size))
+        ours_us, *rest = _cpu_us(operations)
+        records.append(summary(f"replay.{name}_{size}.{end}.cpu_us", "us", ours_us))
+        for theirs_us in rest:
+            ratios = [mine / other for mine, other in zip(ours_us, theirs_us, strict=True)]
+            records.append(summary(f"replay.{name}_{size}.{end}.cpprb_cpu_us", "us", theirs_us))
+            records.append(summary(f"replay.{name}_{size}.{end}.ratio_to_cpprb", "1", ratios))
+    records.append(summary(f"replay.resident_mb.{end}", "MB", [ours.buffer.nbytes / 1e6]))
     return records
 
 
-def _cpu_us(operation: Callable[[], object]) -> list[float]:
-    times = []
+def _cpu_us(operations: list[Callable[[], object]]) -> list[list[float]]:
+    """Returns the CPU times of some operations, taken in turn, so that a noisy moment meets all of them."""
+    times: list[list[float]] = [[] for _ in operations]
     for _ in range(RUNS):
-        begun = time.thread_time_ns()
-        operation()
-        times.append((time.thread_time_ns() - begun) / 1000)
+        for operation, own in zip(operations, times, strict=True):
+            begun = time.thread_time_ns()
+            operation()
+            own.append((time.thread_time_ns() - begun) / 1000)
     return times
 
 
-def _ratio_to_cpprb(capacity: int, sample: Callable[[], object]) -> list[float] | None:
-    """Returns the ratios of our time to cpprb's, in turns; None where cpprb is not installed."""
-    try:
-        import cpprb  # type: ignore[import-not-found]
-    except ImportError:
-        return None
-    fields: dict[str, dict[str, Any]] = {
+class _Ours:
+    """A full buffer and the operations on it; each method returns one that is ready to be timed."""
+
+    def __init__(self, capacity: int) -> None:
+        self.generator = np.random.default_rng(0)
+        self.buffer = ReplayBuffer(capacity, int(capacity * ROWS_EACH), memory_steps=3, heard_steps=3, alpha=0.6)
+        insert = self.insert(INSERT)
+        for _ in range(capacity // INSERT + 1):
+            insert()
+
+    def insert(self, size: int) -> Callable[[], object]:
+        chunk = synthetic_chunk(self.generator, size)
+        priorities = chunk.priorities + np.float32(0.001)
+        return lambda: self.buffer.add([chunk], priorities, 0, 0)
+
+    def sample(self, size: int) -> Callable[[], object]:
+        return lambda: self.buffer.sample(size, 0.4, self.generator)
+
+    def update(self, size: int) -> Callable[[], object]:
+        items = self.buffer.sample(size, 0.4, self.generator).batch.items
+        errors = self.generator.random(size, dtype=np.float32) + np.float32(0.001)
+        return lambda: self.buffer.update(items, errors)
+
+
+class _Cpprb:
+    """The same of cpprb, which holds both states of each transition."""
+
+    FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
         "echoes": {"shape": (6, 24)},
         "next_echoes": {"shape": (6, 24)},
         "taken": {"shape": 3, "dtype": np.uint8},
@@ -115,22 +130,38 @@ def _ratio_to_cpprb(capacity: int, sample: Callable[[], object]) -> list[float] 
         "reward": {},
         "discount": {},
     }
-    theirs = cpprb.PrioritizedReplayBuffer(capacity, fields, alpha=0.6)
-    generator = np.random.default_rng(0)
-    block = {
-        name: generator.random((500, *np.atleast_1d(field.get("shape", 1)))).astype(np.float32)
-        for name, field in fields.items()
-    }
-    for _ in range(capacity // 500):
-        theirs.add(**block, priorities=generator.random(500))
-    ours_us: list[float] = []
-    theirs_us: list[float] = []
-    for _ in range(RUNS):
-        for operation, times in ((sample, ours_us), (lambda: theirs.sample(512, beta=0.4), theirs_us)):
-            begun = time.thread_time_ns()
-            operation()
-            times.append((time.thread_time_ns() - begun) / 1000)
-    return [ours / other for ours, other in zip(ours_us, theirs_us, strict=True)]
+
+    def __init__(self, module: Any, capacity: int) -> None:
+        self.generator = np.random.default_rng(0)
+        self.buffer = module.PrioritizedReplayBuffer(capacity, self.FIELDS, alpha=0.6)
+        insert = self.insert(500)
+        for _ in range(capacity // 500):
+            insert()
+
+    def insert(self, size: int) -> Callable[[], object]:
+        block = {
+            name: self.generator.random((size, *np.atleast_1d(field.get("shape", 1)))).astype(np.float32)
+            for name, field in self.FIELDS.items()
+        }
+        priorities = self.generator.random(size)
+        return lambda: self.buffer.add(**block, priorities=priorities)
+
+    def sample(self, size: int) -> Callable[[], object]:
+        return lambda: self.buffer.sample(size, beta=0.4)
+
+    def update(self, size: int) -> Callable[[], object]:
+        indexes = self.buffer.sample(size, beta=0.4)["indexes"]
+        priorities = self.generator.random(size)
+        return lambda: self.buffer.update_priorities(indexes, priorities)
+
+
+def _cpprb(capacity: int) -> _Cpprb | None:
+    """Returns a full buffer of cpprb; None where it is not installed."""
+    try:
+        import cpprb  # type: ignore[import-not-found]
+    except ImportError:
+        return None
+    return _Cpprb(cpprb, capacity)
 
 
 if __name__ == "__main__":

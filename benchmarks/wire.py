@@ -19,6 +19,8 @@ import numpy as np
 from apex_bat.config.settings import Config, Learner, Replay
 from apex_bat.replay.client import ReplayReader, ReplayWriter
 from apex_bat.replay.server import ReplayServer
+from apex_bat.replay.store import ReplayStore
+from apex_bat.transport.messages import Insert, Sample, encode
 from apex_bat.transport.security import Keys, make_keys
 from apex_bat.transport.weights import WeightsPublisher, WeightsSubscriber
 from benchmarks.replay import Record, summary, synthetic_chunk
@@ -28,6 +30,7 @@ MEASURED_S = 3.0
 ROUNDS = 3
 CHUNKS_AT_ONCE = 16  # the chunks of 16 bats that fly in step are complete at the same time
 BATCH_SIZE = 512
+CAPACITY = 200_000
 INSERTS = 1000
 WARM_UP_INSERTS = 50
 BROADCASTS = 50
@@ -40,16 +43,24 @@ def measure() -> list[Record]:
     """Returns the records that `apex-bat bench wire` writes."""
     with tempfile.TemporaryDirectory() as folder:
         keys = make_keys(Path(folder) / "keys")
-        records = _insert_delays("wire.insert_50", None) + _insert_delays("wire.insert_50.curve", keys)
-        records += _weights_delays("wire.weights_8.max_ms", None) + _weights_delays("wire.weights_8.curve.max_ms", keys)
-        for num_actors in (1, 4, 16):
-            name = "wire.server" if num_actors == 4 else f"wire.server.actors_{num_actors}"
-            records += _saturated(name, num_actors)
+        records: list[Record] = []
+        for end, own in (("", None), (".curve", keys)):
+            records += _insert_delays(f"wire.insert_50{end}", own)
+            records += _sample_delays(f"wire.sample_512{end}", own)
+            records += _weights_delays(f"wire.weights_8{end}.max_ms", own)
+        for num_actors, batch_size, own, name in (
+            (4, 512, None, "wire.server"),
+            (1, 512, None, "wire.server.actors_1"),
+            (16, 512, None, "wire.server.actors_16"),
+            (4, 32, None, "wire.server.batch_32"),
+            (4, 512, keys, "wire.server.curve"),
+        ):
+            records += _saturated(name, num_actors, batch_size, own)
         return records
 
 
-def _settings() -> Config:
-    replay = Replay(capacity=200_000, never_block=True, snapshot_period_s=0.0)
+def _settings(capacity: int) -> Config:
+    replay = Replay(capacity=capacity, never_block=True, snapshot_period_s=0.0)
     return msgspec.structs.replace(Config(), replay=replay, learner=Learner(batch_size=BATCH_SIZE))
 
 
@@ -57,7 +68,7 @@ def _serve(
     addresses: Queue[str], figures: Queue[dict[str, float]], begin: Event, stop: Event, keys: Keys | None
 ) -> None:
     """A process: serves until told to stop, and gives its rates since it was told to begin measuring."""
-    server = ReplayServer(_settings(), "tcp://127.0.0.1:0", np.random.default_rng(0), keys=keys)
+    server = ReplayServer(_settings(CAPACITY), "tcp://127.0.0.1:0", np.random.default_rng(0), keys=keys)
     addresses.put(server.address)
     begun_s, first = time.monotonic(), server.metrics()
     is_measured = False
@@ -96,10 +107,10 @@ class ServerProcess:
         self._process.join(10)
 
 
-def _act(address: str, name: str, stop: Event) -> None:
+def _act(address: str, name: str, keys: Keys | None, stop: Event) -> None:
     """A process: inserts as fast as it is let."""
     chunks = [synthetic_chunk(np.random.default_rng(0))] * CHUNKS_AT_ONCE
-    writer = ReplayWriter(address, name, 4 * CHUNKS_AT_ONCE)
+    writer = ReplayWriter(address, name, 4 * CHUNKS_AT_ONCE, keys=keys)
     while not stop.is_set():
         if writer.has_room:
             writer.send(chunks, 0)
@@ -107,9 +118,9 @@ def _act(address: str, name: str, stop: Event) -> None:
     writer.close()
 
 
-def _learn(address: str, stop: Event) -> None:
+def _learn(address: str, batch_size: int, keys: Keys | None, stop: Event) -> None:
     """A process: takes batches and returns priorities as fast as it can."""
-    reader = ReplayReader(address, BATCH_SIZE, 16)
+    reader = ReplayReader(address, batch_size, 16, keys=keys)
     while not stop.is_set():
         batch = reader.next(0.1)
         if batch is not None:
@@ -117,14 +128,15 @@ def _learn(address: str, stop: Event) -> None:
     reader.close()
 
 
-def _saturated(name: str, num_actors: int) -> list[Record]:
+def _saturated(name: str, num_actors: int, batch_size: int, keys: Keys | None) -> list[Record]:
     """Returns the rates of a server that many synthetic actors and a learner load as much as they can."""
     inserted, batches = [], []
     for _ in range(ROUNDS):
-        with ServerProcess(None) as server:
-            targets = [(_act, (server.address, f"actor{i}", server.stop)) for i in range(num_actors)]
+        with ServerProcess(keys) as server:
+            targets = [(_act, (server.address, f"actor{i}", keys, server.stop)) for i in range(num_actors)]
             clients = [_processes.Process(target=target, args=args, daemon=True) for target, args in targets]
-            clients.append(_processes.Process(target=_learn, args=(server.address, server.stop), daemon=True))
+            learner = (server.address, batch_size, keys, server.stop)
+            clients.append(_processes.Process(target=_learn, args=learner, daemon=True))
             for client in clients:
                 client.start()
             time.sleep(WARM_UP_S * (2 + num_actors))  # they import numpy one after the other on few cores
@@ -134,11 +146,25 @@ def _saturated(name: str, num_actors: int) -> list[Record]:
             for client in clients:
                 client.join(10)
         inserted.append(rates["replay.inserted"])
-        batches.append(rates["replay.sampled"] / BATCH_SIZE)
+        batches.append(rates["replay.sampled"] / batch_size)
+    insert_mb, batch_mb = _message_mb(batch_size)
+    moved_mb = [rows * insert_mb + drawn * batch_mb for rows, drawn in zip(inserted, batches, strict=True)]
     return [
         summary(f"{name}.inserted_per_s", "1/s", inserted),
-        summary(f"{name}.batches_{BATCH_SIZE}_per_s", "1/s", batches),
+        summary(f"{name}.batches_{batch_size}_per_s", "1/s", batches),
+        summary(f"{name}.mb_per_s", "MB/s", moved_mb),
     ]
+
+
+def _message_mb(batch_size: int) -> tuple[float, float]:
+    """Returns what an inserted transition and a batch take on the wire, in MB of 1e6 bytes."""
+    chunks = [synthetic_chunk(np.random.default_rng(0))] * CHUNKS_AT_ONCE
+    store = ReplayStore(_settings(2_000), np.random.default_rng(0))
+    store.add("actor", 0, chunks)
+    batch = store.sample(batch_size, 0)
+    insert = encode(Insert("actor", 0, 1, 1, 0, tuple(chunks)), 0)
+    num_transitions = sum(len(chunk.starts) for chunk in chunks)
+    return len(insert) / num_transitions / 1e6, len(encode(Sample(1, batch), 0)) / 1e6
 
 
 def _insert_delays(name: str, keys: Keys | None) -> list[Record]:
@@ -154,7 +180,30 @@ def _insert_delays(name: str, keys: Keys | None) -> list[Record]:
                 pass
             delays_ms.append((time.perf_counter() - begun) * 1000)
         writer.close()
-    del delays_ms[:WARM_UP_INSERTS]
+    return _quantiles(name, delays_ms[WARM_UP_INSERTS:])
+
+
+def _sample_delays(name: str, keys: Keys | None) -> list[Record]:
+    """Returns the time from asking for a batch of 512 to having it decoded, with nothing else going on."""
+    delays_ms = []
+    with ServerProcess(keys) as server:
+        writer = ReplayWriter(server.address, "actor", 64, keys=keys)
+        for _ in range(100):
+            writer.send([synthetic_chunk(np.random.default_rng(0))], 0)
+            while not writer.flush(1.0):
+                pass
+        writer.close()
+        reader = ReplayReader(server.address, BATCH_SIZE, 1, keys=keys)
+        while len(delays_ms) < INSERTS + WARM_UP_INSERTS:
+            begun = time.perf_counter()
+            if reader.next(10.0) is not None:
+                delays_ms.append((time.perf_counter() - begun) * 1000)
+        reader.close()
+    return _quantiles(name, delays_ms[WARM_UP_INSERTS:])
+
+
+def _quantiles(name: str, delays_ms: list[float]) -> list[Record]:
+    """Returns the median and the 99th percentile of each of five parts of the delays."""
     parts = [delays_ms[start::5] for start in range(5)]
     return [
         summary(f"{name}.{label}_ms", "ms", [float(np.quantile(part, quantile)) for part in parts])

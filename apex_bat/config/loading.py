@@ -14,6 +14,9 @@ import tomli_w
 
 from apex_bat.config.settings import Config
 
+MAX_BYTES = 1 << 20  # of a TOML file: all settings take 10 KB, an arena of 60 walls 6 KB
+_LONG_KEY = re.compile(rb"(?:[^\s=.,\[\]{}]+[ \t]*\.[ \t]*){100}")
+
 
 class ConfigError(ValueError):
     """A setting that is unknown, of the wrong type, out of range or in contradiction with another."""
@@ -38,6 +41,8 @@ def load(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
         return msgspec.convert(table, Config)
     except msgspec.ValidationError as error:
         raise ConfigError(origin + _explain(str(error))) from None
+    except RecursionError:
+        raise ConfigError(f"{origin}tables within tables without end") from None
 
 
 def save(config: Config, path: Path) -> None:
@@ -56,14 +61,30 @@ def differences(left: Config, right: Config) -> list[str]:
     return [f"{key}: {a[key]} | {b[key]}" for key in a if a[key] != b[key]]
 
 
+def parse_toml(data: bytes) -> dict[str, Any]:
+    """Returns the table in the bytes of a TOML file, in a time that its size bounds.
+
+    Raises:
+        ValueError: it is no TOML, larger than MAX_BYTES, or has a key of 100 parts: the time for one grows with the
+            square of their number, minutes for 50,000 (measured). Numbers of thousands of digits raise it too.
+        RecursionError: arrays or tables within one another without end.
+    """
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"larger than {MAX_BYTES} bytes")
+    if _LONG_KEY.search(data):
+        raise ValueError("a key of a hundred parts")
+    return tomllib.loads(data.decode("utf-8"))
+
+
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return _with_none(tomllib.loads(path.read_text(encoding="utf-8")))
+        with path.open("rb") as file:
+            return _with_none(parse_toml(file.read(MAX_BYTES + 1)))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; configurations that ship are in configs/") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
 
 
@@ -90,8 +111,8 @@ def _value(text: str) -> Any:
     if text.strip("\"'") == "none":
         return None
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return parse_toml(f"value = {text}".encode())["value"]
+    except (ValueError, RecursionError):
         return text
 
 

@@ -14,11 +14,12 @@ from typing import Literal, NamedTuple
 
 from apex_bat.transport.messages import Insert, InsertHeader
 
+MAX_ACTORS = 65_535  # names remembered: each costs memory for ever, and a stranger could make up any number
 MAX_RETIRED = 16  # incarnations remembered for each actor, so that a cut-off twin is recognised
 
 Verdict = Literal["queued", "stored", "held", "gap", "superseded", "flood"]
 """What became of an arrival: it waits to be stored; it was stored before; it waits already; an earlier one is missing;
-its sender was replaced by another of its name; its sender sends more than its window."""
+its sender was replaced by another of its name; its sender sends more than its window, or all together too much."""
 
 
 class Arrival(NamedTuple):
@@ -28,6 +29,8 @@ class Arrival(NamedTuple):
     """The insert; only its header when its content was wrong."""
     refused: str
     """Why it must be refused, or empty."""
+    num_bytes: int = 0
+    """Size of the message that brought it."""
 
 
 class StoredSequence(NamedTuple):
@@ -52,10 +55,13 @@ class Arrivals:
 
     Args:
         max_queued: inserts of one actor that may wait.
+        max_bytes: of all inserts that wait; the first of an empty queue is taken however large it is.
     """
 
-    def __init__(self, max_queued: int) -> None:
+    def __init__(self, max_queued: int, max_bytes: int = 1 << 62) -> None:
         self._max_queued = max_queued
+        self._max_bytes = max_bytes
+        self._num_bytes = 0
         self._senders: dict[str, _Sender] = {}
         self._queues: OrderedDict[str, deque[Arrival]] = OrderedDict()  # in the order in which they are served
 
@@ -75,6 +81,8 @@ class Arrivals:
         if sender is None or sender.incarnation != header.incarnation:
             if sender is not None and header.incarnation in sender.retired:
                 return "superseded"
+            if sender is None and len(self._senders) >= MAX_ACTORS:
+                return "flood"
             sender = self._welcome(header, peer, sender)
         sender.peer = peer
         if header.first_unacknowledged - 1 > sender.newest:
@@ -85,10 +93,12 @@ class Arrivals:
             return "held"
         if header.sequence > sender.newest + 1:
             return "gap"
-        queue = self._queues.setdefault(header.actor, deque())
-        if len(queue) >= self._max_queued:
+        num_queued = len(self._queues.get(header.actor, ()))
+        is_too_much = self._queues and self._num_bytes + arrival.num_bytes > self._max_bytes
+        if num_queued >= self._max_queued or is_too_much:
             return "flood"
-        queue.append(arrival)
+        self._queues.setdefault(header.actor, deque()).append(arrival)
+        self._num_bytes += arrival.num_bytes
         sender.newest = header.sequence
         return "queued"
 
@@ -103,7 +113,8 @@ class Arrivals:
             The connection to acknowledge it to; None when its actor has been replaced meanwhile.
         """
         actor, queue = next(iter(self._queues.items()))
-        header = queue.popleft().header
+        header, _, num_bytes = queue.popleft()
+        self._num_bytes -= num_bytes
         if queue:
             self._queues.move_to_end(actor)
         else:
@@ -128,6 +139,7 @@ class Arrivals:
     def restore(self, sequences: dict[str, StoredSequence]) -> None:
         """Takes over what a snapshot says was stored."""
         self._queues.clear()
+        self._num_bytes = 0
         self._senders = {
             actor: _Sender(s.incarnation, s.sequence, s.sequence, b"", deque(s.retired, MAX_RETIRED))
             for actor, s in sequences.items()

@@ -187,6 +187,12 @@ class ReplayBuffer:
         self._tree.set(positions, priorities[held].astype(np.float64) ** self.alpha)
         return len(items) - len(positions)
 
+    def some_priorities(self, most: int) -> NDArray[np.float32]:
+        """Returns the priorities, before the exponent, of at most `most` items, evenly spread from oldest to newest."""
+        held = np.arange(self._first_item, self._next_item, max(1, -(-len(self) // most)))
+        priorities: NDArray[np.float32] = self._items["priority"].take(held % self.capacity)
+        return priorities
+
     def set_alpha(self, alpha: float) -> None:
         """Changes the exponent, and with it the whole tree: tens of milliseconds at a million items."""
         if alpha != self.alpha:

@@ -65,6 +65,11 @@ class RateLimiter:
         self._set_law(samples_per_insert, error_buffer)
 
     @property
+    def law(self) -> tuple[float, float]:
+        """`samples_per_insert` and `error_buffer` now."""
+        return self.samples_per_insert, self.error_buffer
+
+    @property
     def balance(self) -> float:
         """Samples that inserts have earned and nobody has taken yet; negative: taken in advance."""
         earned = self.samples_per_insert * (self.inserted - self._origin_inserted)
@@ -81,6 +86,11 @@ class RateLimiter:
         if self.never_block or self.inserted < self.min_size:
             return True
         return self.balance + self.samples_per_insert * num_transitions <= self.error_buffer
+
+    @property
+    def holds_back_inserts(self) -> bool:
+        """Whether the largest insert would have to wait now."""
+        return not self.can_insert(self._largest_insert)
 
     def can_sample(self, num_transitions: int) -> bool:
         """Whether a sample of so many transitions need not wait."""

@@ -21,6 +21,7 @@ ASK_AGAIN_S = 2.0  # silence of a server after which its requests go again; a li
 WAKE_S = 0.1  # longest sleep of the thread, so that deadlines are seen
 RETRY_S = 0.02  # the same while there is no connection
 MAX_UPDATES = 1024  # priority updates that may wait for the thread
+MAX_ITEMS = 1 << 20  # of one message: what the wire lets through
 
 
 class ReplayReader:
@@ -182,8 +183,8 @@ class ReplayReader:
             server.outstanding.add(self._last_request)
             server.unsent.add(self._last_request)
         for server in self._servers:
-            if server.is_silent(self._ask_again_s):
-                server.heard_s = time.monotonic()
+            if server.is_silent(self._ask_again_s) and time.monotonic() - server.asked_again_s > self._ask_again_s:
+                server.asked_again_s = time.monotonic()  # not heard_s: `waiting` goes on saying that it is silent
                 self.asked_again += len(server.outstanding - server.unsent)
                 server.unsent |= server.outstanding
             for request in sorted(server.unsent):
@@ -193,11 +194,14 @@ class ReplayReader:
                 server.unsent.remove(request)
 
     def _send_updates(self) -> None:
-        """Sends all updates that wait as one message a server; of an item that comes twice the later one counts."""
-        waiting = [self._updates.popleft() for _ in range(len(self._updates))]
-        if not waiting:
-            return
-        steps, items_each, priorities_each = zip(*waiting, strict=True)
+        """Sends all updates that wait, as few messages."""
+        while self._updates:
+            number = min(len(self._updates), max(1, MAX_ITEMS // self._batch_size))
+            self._send_joined([self._updates.popleft() for _ in range(number)])
+
+    def _send_joined(self, updates: Sequence[tuple[int, NDArray[np.int64], NDArray[np.float32]]]) -> None:
+        """Sends updates as one message a server; of an item that comes twice the later one counts."""
+        steps, items_each, priorities_each = zip(*updates, strict=True)
         items, priorities = np.concatenate(items_each), np.concatenate(priorities_each)
         for shard, server in enumerate(self._servers):
             mine = items % len(self._servers) == shard
@@ -206,7 +210,7 @@ class ReplayReader:
             local = (items[mine] // len(self._servers)).astype(np.int64)
             message = PriorityUpdate(steps[-1], local, priorities[mine].astype(np.float32))
             if not _send(server, encode(message, self._generation)):
-                self.dropped_updates += len(waiting)
+                self.dropped_updates += len(updates)
 
     def _receive(self, shard: int, server: _Server) -> None:
         while server.connection.socket.poll(0):
@@ -240,6 +244,7 @@ class _Server:
         self.unsent: set[int] = set()  # those of them that must still go, or go again
         self.reason = ""
         self.heard_s = time.monotonic()
+        self.asked_again_s = float("-inf")
 
     def is_silent(self, longer_than_s: float) -> bool:
         """Whether it owes an answer and has said nothing for long."""

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import zmq
@@ -21,7 +20,8 @@ import zmq
 from apex_bat.config.settings import Config
 from apex_bat.replay.arrivals import Arrival, Arrivals, StoredSequence
 from apex_bat.replay.heap import keep_freed_memory
-from apex_bat.replay.snapshot import SnapshotWriter, read_snapshot
+from apex_bat.replay.requests import SampleRequests
+from apex_bat.replay.snapshot import SnapshotError, SnapshotWriter, read_snapshot
 from apex_bat.replay.store import RefusedChunkError, ReplayStore
 from apex_bat.transport.messages import (
     Ack,
@@ -30,13 +30,15 @@ from apex_bat.transport.messages import (
     Message,
     MessageError,
     PriorityUpdate,
+    Ratio,
+    RatioChange,
     Sample,
     SampleRequest,
     Waiting,
     decode,
     encode,
 )
-from apex_bat.transport.refusals import Refusals
+from apex_bat.transport.refusals import REASONS, Refusals
 from apex_bat.transport.security import Keys
 from apex_bat.transport.sockets import Listener
 
@@ -44,14 +46,9 @@ logger = logging.getLogger(__name__)
 
 RECEIVE_AT_ONCE = 64  # messages taken from the socket before those that wait are looked at
 WORK_S = 0.003  # time each for requests and for inserts that wait, before the socket is looked at again
-MAX_REQUESTS = 1024  # sample requests that may wait
+MAX_QUEUED_MESSAGES = 8  # of the largest size that may be sent: as many bytes of inserts may wait, whoever sent them
 NOTICE_PERIOD_S = 0.5  # how often the held-back are told why; clients send again only when they hear nothing
 COPY_BELOW_BYTES = 65_536  # ZeroMQ sends larger messages without copying them
-
-
-class _Request(NamedTuple):
-    peer: bytes
-    message: SampleRequest
 
 
 class ReplayServer:
@@ -88,8 +85,9 @@ class ReplayServer:
     ) -> None:
         keep_freed_memory()
         self.store = ReplayStore(config, generator)
-        self._arrivals = Arrivals(config.actor.window_chunks)
-        self._requests: deque[_Request] = deque()
+        self._arrivals = Arrivals(config.actor.window_chunks, MAX_QUEUED_MESSAGES * config.transport.max_message_bytes)
+        self._requests = SampleRequests()
+        self._batch_size = config.learner.batch_size
         self._snapshot_path = snapshot_path
         self._snapshot_period_s = config.replay.snapshot_period_s
         self._snapshot: SnapshotWriter | None = None
@@ -104,6 +102,7 @@ class ReplayServer:
         self._listener = Listener(
             zmq.ROUTER,
             address,
+            self._refusals,
             keys=keys,
             max_message_bytes=config.transport.max_message_bytes,
             options={zmq.ROUTER_MANDATORY: 1},
@@ -132,6 +131,9 @@ class ReplayServer:
         """Returns all figures that `replay.metrics.METRICS` describes."""
         figures = self.store.metrics() | {f"replay.{name}": float(count) for name, count in self._counts.items()}
         figures["replay.refused_messages"] = self._refusals.total
+        refused = self.refusals
+        figures |= {f"replay.refused_messages.{reason}": float(refused.get(reason, 0)) for reason in REASONS}
+        figures["replay.ended_connections"] = self._listener.num_ended
         figures["replay.queued_inserts"] = len(self._arrivals)
         figures["replay.queued_requests"] = len(self._requests)
         figures |= {f"replay.{phase}_s": seconds for phase, seconds in self._phases_s.items()}
@@ -140,11 +142,7 @@ class ReplayServer:
     @property
     def refusals(self) -> dict[str, int]:
         """Refused messages so far, by reason."""
-        return dict(self._refusals.counts)
-
-    def change_ratio(self, samples_per_insert: float, error_buffer: float | None = None) -> None:
-        """Changes the law of the rate limiter from now on; raises ValueError if it could lead to a standstill."""
-        self.store.limiter.change(samples_per_insert, error_buffer)
+        return self._refusals.counts.copy()
 
     def save(self) -> None:
         """Writes a snapshot and waits for it. Raises OSError if that fails, ValueError without a path."""
@@ -163,11 +161,14 @@ class ReplayServer:
         if self._snapshot_path is None:
             raise FileNotFoundError("this server has no snapshot_path")
         state, path = read_snapshot(self._snapshot_path, self.store.buffer)
-        self.store.restore(state)
-        self._arrivals.restore(
-            {actor: StoredSequence(s[0], s[1], tuple(s[2])) for actor, s in state["sequences"].items()}
-        )
-        self._counts |= state["counts"]
+        try:
+            self.store.restore(state)
+            self._arrivals.restore(
+                {actor: StoredSequence(s[0], s[1], tuple(s[2])) for actor, s in state["sequences"].items()}
+            )
+            self._counts |= {name: int(state["counts"][name]) for name in _COUNTS}
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise SnapshotError(f"{path}: its state contradicts itself: {error!r}") from error
         counters = self.store.buffer.counters
         return f"replay: {len(self.store.buffer)} transitions, {counters.next_item} ever inserted, from {path}"
 
@@ -185,26 +186,38 @@ class ReplayServer:
                 return
             try:
                 if len(parts) != 2:
-                    raise MessageError("size", f"{len(parts) - 1} parts instead of one")
+                    raise MessageError("parts", f"{len(parts) - 1} instead of one")
                 message = decode(parts[1], self._generation)
             except MessageError as error:
-                self._refuse(parts[0], error)
+                self._refuse(parts[0], error, len(parts[-1]))
             else:
                 self._spend("receive", begun)
-                self._handle(parts[0], message)
+                self._handle(parts[0], message, len(parts[1]))
 
-    def _handle(self, peer: bytes, message: Message) -> None:
+    def _handle(self, peer: bytes, message: Message, num_bytes: int) -> None:
         match message:
             case Insert():
-                self._arrive(peer, Arrival(message, ""))
+                self._arrive(peer, Arrival(message, "", num_bytes))
             case SampleRequest():
-                self._queue_request(_Request(peer, message))
+                self._queue_request(peer, message)
             case PriorityUpdate(learner_step, items, priorities):
                 begun = time.perf_counter()
                 self.store.update(learner_step, items, priorities)
                 self._spend("update", begun)
+            case RatioChange():
+                self._send(peer, self._changed(message))
             case _:
                 self._refusals.count("unexpected", f"a replay server takes no {type(message).__name__}")
+
+    def _changed(self, change: RatioChange) -> Ratio:
+        """Changes the law of the rate limiter, or says why not."""
+        limiter, refused = self.store.limiter, ""
+        try:
+            limiter.change(change.samples_per_insert, change.error_buffer)
+            logger.warning("samples per insert is now %g, within %g samples", *limiter.law)
+        except ValueError as error:
+            refused = str(error)
+        return Ratio(*limiter.law, refused)
 
     def _arrive(self, peer: bytes, arrival: Arrival) -> None:
         header = arrival.header
@@ -219,21 +232,20 @@ class ReplayServer:
             self._refusals.count("superseded", f"{header.actor}: another incarnation has taken its place")
             self._send(peer, Ack(header.incarnation, header.sequence, superseded=True))
 
-    def _queue_request(self, request: _Request) -> None:
+    def _queue_request(self, peer: bytes, request: SampleRequest) -> None:
+        if request.batch_size != self._batch_size:
+            self._refusals.count("batch_size", f"{request.batch_size}; learner.batch_size is {self._batch_size}")
+            return
         # Noted on arrival: when the request's turn comes, a later update may have told a later step.
-        self.store.learner_step = request.message.learner_step
-        if any(r.peer == request.peer and r.message.request == request.message.request for r in self._requests):
-            return
-        if len(self._requests) >= MAX_REQUESTS:
-            self._refusals.count("flood", f"more than {MAX_REQUESTS} sample requests wait")
-            return
-        self._requests.append(request)
+        self.store.learner_step = request.learner_step
+        if self._requests.offer(peer, request) == "flood":
+            self._refusals.count("flood", f"{len(self._requests)} sample requests wait already")
 
-    def _refuse(self, peer: bytes, error: MessageError) -> None:
+    def _refuse(self, peer: bytes, error: MessageError, num_bytes: int) -> None:
         """Counts a bad message. A bad insert with a readable header is refused in its turn: its actor can go on."""
         if isinstance(error.head, InsertHeader):
             self._refusals.count(error.fault, f"{error.head.actor}: {error}")
-            self._arrive(peer, Arrival(error.head, str(error)))
+            self._arrive(peer, Arrival(error.head, str(error), num_bytes))
         else:
             self._refusals.count(error.fault, str(error))
 
@@ -253,7 +265,7 @@ class ReplayServer:
         if arrival is None:
             return False
         begun = time.perf_counter()
-        header, reason = arrival
+        header, reason, _ = arrival
         num_transitions = _num_transitions(header)
         if isinstance(header, Insert) and not reason:
             if not self.store.can_add(num_transitions):
@@ -274,10 +286,11 @@ class ReplayServer:
 
     def _answer_next(self) -> bool:
         """Answers the oldest sample request; returns whether there was one that need not wait."""
-        if not self._requests or not self.store.can_sample(self._requests[0].message.batch_size):
+        request = self._requests.peek()
+        if request is None or not self.store.can_sample(request.batch_size):
             return False
         begun = time.perf_counter()
-        peer, request = self._requests.popleft()
+        peer, _ = self._requests.take()
         batch = self.store.sample(request.batch_size, self.store.learner_step)
         if self._send(peer, Sample(request.request, batch)):
             self.store.count_sample(request.batch_size)
@@ -287,8 +300,7 @@ class ReplayServer:
     def _notify(self) -> None:
         """Tells everybody who is held back that the server lives, and for whom it waits."""
         self._next_notice_s = self._clock() + NOTICE_PERIOD_S
-        peers = {request.peer for request in self._requests} | set(self._arrivals.waiting_peers())
-        for peer in peers:
+        for peer in self._requests.peers() | set(self._arrivals.waiting_peers()):
             self._send(peer, Waiting(self.state()))
 
     def _send(self, peer: bytes, message: Message) -> bool:

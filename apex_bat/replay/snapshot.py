@@ -32,6 +32,8 @@ MAGIC = b"ABREPLAY"
 VERSION = 1
 PREFIX = struct.Struct("<8sIIQQ")  # magic, version, CRC-32 of the header, its offset, its size
 SLICE_ROWS = 1 << 14  # rows of a section: 3 MB of frames
+_LIES = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, RecursionError)
+"""What a header raises that is sound by its checksum and says what cannot be."""
 PASSES = 3  # over the rows; each is shorter than the one before
 
 
@@ -158,7 +160,7 @@ def read_snapshot(path: Path, buffer: ReplayBuffer) -> tuple[dict[str, Any], Pat
             return _read(file, buffer), file
         except (OSError, SnapshotError) as error:
             reason = str(error)
-        except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:  # a header that lies
+        except _LIES as error:
             reason = f"{file}: its content contradicts itself: {error!r}"
         buffer.restore(BufferCounters(0, 0, 0))
         reasons.append(reason)

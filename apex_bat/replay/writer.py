@@ -117,6 +117,7 @@ class ReplayWriter:
         if self._window and self._connection.socket.poll(int(timeout_s * 1000)):
             self._receive()
         if self._window and self._clock() >= self._patience_ends_s:
+            self.waiting = ""  # what a silent server said last is no longer why nothing comes
             self.resent += self._next_to_send - next(iter(self._window))
             self._next_to_send = next(iter(self._window))
             self._patience_ends_s = self._clock() + self._resend_s

@@ -7,12 +7,12 @@ A name is `simple` (a file under configs/arenas), `yard.toml` (a path), `corrido
 from __future__ import annotations
 
 import sysconfig
-import tomllib
 from functools import cache
 from pathlib import Path
 
 import msgspec
 
+from apex_bat.config.loading import MAX_BYTES, parse_toml
 from apex_bat.config.settings import Body, Episode
 from apex_bat.simulation.generated import FAMILIES, POOL_SIZE, generate_arena
 from apex_bat.simulation.layout import Arena, ArenaError, Model, Pillar, Wall
@@ -100,16 +100,17 @@ def _seeds(name: str, text: str) -> range:
 @cache
 def _read(path: Path) -> Arena:
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        with path.open("rb") as file:
+            table = parse_toml(file.read(MAX_BYTES + 1))
     except FileNotFoundError:
         raise ArenaError(f"{path}: no such arena file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ArenaError(f"{path}: cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ArenaError(f"{path}: not valid TOML: {error}") from None
     try:
         arena = msgspec.convert(table, Arena)
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, RecursionError) as error:
         raise ArenaError(f"{path}: malformed arena: {error}") from None
     models = tuple(model._replace(file=str(path.parent / model.file)) for model in arena.models)
     return msgspec.structs.replace(arena, name=arena.name or path.stem, models=models)

@@ -8,7 +8,7 @@ of ears has the order left, right. The default is a fit of this project to the m
 from __future__ import annotations
 
 import math
-import zipfile
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from scipy.special import j1
 
 from apex_bat.config import settings
 from apex_bat.experience import NUM_EARS
+from apex_bat.storage import read_npz
 
 Floats = NDArray[np.float64]
 
@@ -95,17 +96,18 @@ def _table_db(path: str, azimuth_rad: Floats, elevation_rad: Floats) -> Floats:
 def _read_table(path: str) -> tuple[Floats, Floats, Floats]:
     """Returns azimuth_rad (a,), elevation_rad (e,) and level_db (2, a, e) of an .npz file."""
     try:
-        with np.load(path, allow_pickle=False) as table:
-            azimuth, elevation, level = (
-                np.asarray(table[name], np.float64) for name in ("azimuth_rad", "elevation_rad", "level_db")
-            )
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        table = read_npz(Path(path))
+        azimuth, elevation, level = (
+            np.asarray(table[name], np.float64) for name in ("azimuth_rad", "elevation_rad", "level_db")
+        )
+    except (KeyError, ValueError) as error:
         raise ValueError(f"directivity_table {path!r} cannot be read: {error}") from error
-    if level.shape != (NUM_EARS, len(azimuth), len(elevation)):
+    if azimuth.ndim != 1 or elevation.ndim != 1 or level.shape != (NUM_EARS, len(azimuth), len(elevation)):
         raise ValueError(
             f"directivity_table {path!r}: level_db has shape {level.shape}, "
             f"but needs {(NUM_EARS, len(azimuth), len(elevation))}: ears, azimuths, elevations"
         )
-    if (np.diff(azimuth) <= 0.0).any() or (np.diff(elevation) <= 0.0).any() or not np.isfinite(level).all():
+    is_finite = all(np.isfinite(array).all() for array in (azimuth, elevation, level))
+    if not (is_finite and (np.diff(azimuth) > 0.0).all() and (np.diff(elevation) > 0.0).all()):
         raise ValueError(f"directivity_table {path!r}: angles must rise and levels must be finite")
     return azimuth, elevation, level

@@ -27,6 +27,10 @@ class Wall(NamedTuple):
     height_m: float
 
 
+MAX_AREA_M2 = 10_000.0
+"""Of the rectangle around an arena: a grid of it must fit into memory, and the thesis's take some 200."""
+
+
 class Pillar(NamedTuple):
     """An upright cylinder that stands on the floor."""
 
@@ -75,6 +79,9 @@ class Arena(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             raise ValueError(f"centre_line has {len(self.centre_line)} corners; a closed line needs at least 3")
         if not (self.walls or self.pillars or self.models):
             raise ValueError("there are neither walls nor pillars nor models")
+        (left, right), (low, high) = ((min(values), max(values)) for values in zip(*self.corners(), strict=True))
+        if not (right - left) * (high - low) <= MAX_AREA_M2:  # also true of what is not a number
+            raise ValueError(f"{right - left:g} by {high - low:g} m; at most {MAX_AREA_M2:g} square metres")
 
     @property
     def top_m(self) -> float | None:

@@ -25,7 +25,7 @@ PREFIX = struct.Struct("<4sHHIIQ")  # magic, protocol, reserved (0), header byte
 MAX_HEADER_BYTES = 1 << 20
 ALIGNMENT = 8
 
-Fault = Literal["foreign", "protocol", "generation", "size", "header", "shape", "value"]
+Fault = Literal["foreign", "protocol", "generation", "size", "parts", "header", "shape", "value", "unexpected", "role"]
 Data = bytes | bytearray | memoryview
 ArraySpec = tuple[DTypeLike, tuple[int, ...]]
 
@@ -34,7 +34,7 @@ class MessageError(ValueError):
     """Bytes that are not a message of ours.
 
     Attributes:
-        fault: which check failed; few distinct words, so that refusals can be counted by it.
+        fault: which check failed, a key of `refusals.REASONS`.
         head: the header, where that much could be read; an insert is refused under its sender's name with it.
     """
 

@@ -113,6 +113,23 @@ class PriorityUpdate(NamedTuple):
     priorities: NDArray[np.float32]
 
 
+class RatioChange(Header, frozen=True, tag="ratio"):
+    """Asks the replay server for another law of the rate limiter; sent twice, it is the same law."""
+
+    samples_per_insert: Annotated[float, Meta(gt=0.0, le=1e6)]
+    error_buffer: Annotated[float, Meta(ge=0.0, le=1e12)] | None = None
+    """Half-width of the band, samples; None: the least that suits the ratio."""
+
+
+class Ratio(Header, frozen=True, tag="ratio_now"):
+    """The law of the rate limiter that holds now: the answer to a `RatioChange`."""
+
+    samples_per_insert: float
+    error_buffer: float
+    refused: Text = ""
+    """Why the change was refused; empty when it was made."""
+
+
 class WeightsHeader(Header, frozen=True, tag="weights"):
     """Header of `Weights`."""
 
@@ -142,5 +159,16 @@ class Report(Header, frozen=True, tag="report"):
     metrics: Annotated[dict[Name, float], Meta(max_length=1024)]
 
 
-Message = Insert | Ack | Waiting | SampleRequest | Sample | PriorityUpdate | Weights | Report
-Headers = InsertHeader | Ack | Waiting | SampleRequest | SampleHeader | PriorityHeader | WeightsHeader | Report
+Message = Insert | Ack | Waiting | SampleRequest | Sample | PriorityUpdate | RatioChange | Ratio | Weights | Report
+Headers = (
+    InsertHeader
+    | Ack
+    | Waiting
+    | SampleRequest
+    | SampleHeader
+    | PriorityHeader
+    | RatioChange
+    | Ratio
+    | WeightsHeader
+    | Report
+)

@@ -3,6 +3,7 @@
     actor   -> replay   Insert            replay -> actor    Ack, Waiting
     learner -> replay   SampleRequest     replay -> learner  Sample, Waiting
     learner -> replay   PriorityUpdate
+    anybody -> replay   RatioChange       replay -> anybody  Ratio
     learner -> actors   Weights           any    -> launcher Report
 
 `decode` either returns a message whose sizes, shapes, types and values are right or raises `MessageError`, whatever the
@@ -22,6 +23,8 @@ from apex_bat.transport.kinds import (
     InsertHeader,
     Message,
     PriorityUpdate,
+    Ratio,
+    RatioChange,
     Report,
     Sample,
     SampleRequest,
@@ -41,6 +44,8 @@ __all__ = [
     "SampleRequest",
     "Sample",
     "PriorityUpdate",
+    "RatioChange",
+    "Ratio",
     "Weights",
     "Report",
 ]

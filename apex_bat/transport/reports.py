@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Collection
 
 import msgspec
 import zmq
@@ -16,7 +17,7 @@ from apex_bat.transport.sockets import Connection, Listener
 logger = logging.getLogger(__name__)
 
 MAX_REPORT_BYTES = 1 << 20
-AT_ONCE = 1000  # reports taken from the socket by one poll
+AT_ONCE = 1000  # messages taken from the socket by one poll, whatever they are
 
 
 class Reporter:
@@ -39,7 +40,12 @@ class Reporter:
         self.dropped = 0
 
     def send(self, report: Report) -> bool:
-        """Sends a report, without the metrics that are not finite; returns False if it was dropped."""
+        """Sends a report, without the metrics that are not finite; returns False if it was dropped.
+
+        Raises:
+            TransportError: the launcher refused our keys.
+        """
+        self._connection.check()
         finite = {name: value for name, value in report.metrics.items() if math.isfinite(value)}
         try:
             data = encode(msgspec.structs.replace(report, metrics=finite), self._generation)
@@ -61,37 +67,53 @@ class ReportCollector:
         address: where to listen; port 0 takes any free one.
         keys: CURVE keys, for an address that is not loopback.
         generation: of this address; None accepts the reports of any.
+        roles: names of the roles that may report; None: any. Reports choose the names of files.
 
     Attributes:
         address: where it listens.
-        refusals: counts of refused reports by reason.
+        refusals: counts of refused reports and connections by reason.
 
     Raises:
         TransportError: the address cannot be used.
     """
 
-    def __init__(self, address: str, *, keys: Keys | None = None, generation: int | None = None) -> None:
-        self._listener = Listener(zmq.PULL, address, keys=keys, max_message_bytes=MAX_REPORT_BYTES)
-        self._generation = generation
-        self.address = self._listener.address
+    def __init__(
+        self,
+        address: str,
+        *,
+        keys: Keys | None = None,
+        generation: int | None = None,
+        roles: Collection[str] | None = None,
+    ) -> None:
         self.refusals = Refusals(logger)
+        self._listener = Listener(zmq.PULL, address, self.refusals, keys=keys, max_message_bytes=MAX_REPORT_BYTES)
+        self._generation = generation
+        self._roles = None if roles is None else frozenset(roles)
+        self.address = self._listener.address
 
     def poll(self, timeout_s: float) -> list[Report]:
-        """Returns the reports that are there, waiting up to `timeout_s` for the first."""
+        """Returns the reports that are there, waiting up to `timeout_s` for the first message."""
         reports: list[Report] = []
         wait_ms = int(timeout_s * 1000)
-        while len(reports) < AT_ONCE and self._listener.socket.poll(wait_ms):
+        for _ in range(AT_ONCE):  # refused ones count too, or a flood of them would never let us go
+            if not self._listener.socket.poll(wait_ms):
+                break
             wait_ms = 0
             try:
-                message = decode(self._listener.socket.recv(zmq.NOBLOCK), self._generation)
+                reports.append(self._checked(self._listener.socket.recv_multipart(zmq.NOBLOCK)))
             except MessageError as error:
                 self.refusals.count(error.fault, str(error))
-                continue
-            if isinstance(message, Report):
-                reports.append(message)
-            else:
-                self.refusals.count("unexpected", f"a {type(message).__name__} instead of a report")
         return reports
+
+    def _checked(self, parts: list[bytes]) -> Report:
+        if len(parts) != 1:
+            raise MessageError("parts", f"{len(parts)} instead of one")
+        message = decode(parts[0], self._generation)
+        if not isinstance(message, Report):
+            raise MessageError("unexpected", f"a {type(message).__name__} instead of a report")
+        if self._roles is not None and message.role not in self._roles:
+            raise MessageError("role", f"{message.role} is no role of this run")
+        return message
 
     def close(self) -> None:
         """Closes the socket; may be called twice."""

@@ -9,20 +9,20 @@ from __future__ import annotations
 
 import os
 import stat
+import struct
 from pathlib import Path
 from typing import NamedTuple
 
 import zmq
 import zmq.auth
 from zmq.auth.thread import ThreadAuthenticator
-from zmq.utils.monitor import recv_monitor_message
+from zmq.utils import z85
+
+from apex_bat.transport.refusals import Refusals
 
 ZAP_DOMAIN = "apex_bat"  # named on socket and authenticator alike: "*" did not match a socket's own domain (measured)
-KEY_CHARACTERS = 40  # Z85 of 32 bytes
-
-_REFUSED_EVENTS = (
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH
-)
+KEY_CHARACTERS, KEY_BYTES = 40, 32  # in Z85 and decoded
+MAX_KEY_FILE_BYTES = 1 << 20  # 25,000 allowed clients
 
 
 class TransportError(RuntimeError):
@@ -45,41 +45,59 @@ def make_keys(folder: Path) -> Keys:
     """Writes new keys of a server and a client into a folder (mode 0700, files 0600) and returns them.
 
     Raises:
-        TransportError: the folder holds keys already, or cannot be written.
+        TransportError: the folder holds keys already, others may enter it, or it cannot be written.
     """
     server_public, server_secret = zmq.curve_keypair()
     client_public, client_secret = zmq.curve_keypair()
-    lines = {
-        "server.public": server_public,
-        "server.secret": server_secret,
-        "client.public": client_public,
-        "client.secret": client_secret,
-        "allowed_clients": client_public,
-    }
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        for name, line in lines.items():
-            descriptor = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(line + b"\n")
-    except FileExistsError as error:
-        raise TransportError(
-            f"{error.filename}: exists already; give another folder, or remove the old keys"
-        ) from error
-    except OSError as error:
-        raise TransportError(f"{folder}: keys cannot be written there: {error.strerror}") from error
+    _write_keys(
+        folder,
+        {
+            "server.public": server_public,
+            "server.secret": server_secret,
+            "client.public": client_public,
+            "client.secret": client_secret,
+            "allowed_clients": client_public,
+        },
+    )
     return Keys(server_public, client_public, client_secret, server_secret, frozenset([client_public]))
+
+
+def make_client_keys(folder: Path, client_folder: Path) -> Keys:
+    """Writes a further client's keys into a folder of its own and lists it among the allowed clients of `folder`.
+
+    A host with keys of its own can be shut out alone: take its line out of `allowed_clients` and start the run anew.
+
+    Raises:
+        TransportError: `folder` holds no keys of a server, or `client_folder` holds keys already.
+    """
+    known = load_keys(folder)
+    if known.server_secret is None:
+        raise TransportError(f"{folder}: has no server.secret; make the keys of clients where the server's are")
+    public, secret = zmq.curve_keypair()
+    lines = {"server.public": known.server_public, "client.public": public, "client.secret": secret}
+    _write_keys(client_folder, lines)
+    try:
+        with (folder / "allowed_clients").open("ab") as file:
+            file.write(public + b"\n")
+    except OSError as error:
+        raise TransportError(f"{folder / 'allowed_clients'}: cannot be written: {error.strerror}") from error
+    return Keys(known.server_public, public, secret)
 
 
 def load_keys(folder: Path) -> Keys:
     """Returns the keys of a folder.
 
     Raises:
-        TransportError: a file is missing, is no key, or others than its owner may read or write it.
+        TransportError: a file is missing, is no key, or others than its owner may read or write it or its folder.
     """
     server_secret = None
     allowed: frozenset[bytes] = frozenset()
-    if (folder / "server.secret").exists():
+    try:
+        check_private(folder, 0o700)
+        is_server = (folder / "server.secret").exists()
+    except (OSError, ValueError) as error:
+        raise TransportError(f"{folder}: {_reason(error)}; make keys with `apex-bat keys {folder}`") from error
+    if is_server:
         server_secret = _read_keys(folder / "server.secret")[0]
         allowed = frozenset(_read_keys(folder / "allowed_clients"))
     return Keys(
@@ -91,11 +109,33 @@ def load_keys(folder: Path) -> Keys:
     )
 
 
-def start_authenticator(context: zmq.Context[zmq.Socket[bytes]], keys: Keys) -> ThreadAuthenticator:
+def check_private(path: Path, mode: int) -> None:
+    """Refuses a file or folder that belongs to another user or that others may use; does nothing outside POSIX.
+
+    Args:
+        path: what to look at.
+        mode: what it should have, for the advice in the message.
+
+    Raises:
+        TransportError: somebody else than this user, or root, could read, write or replace what is there.
+        OSError: there is nothing.
+    """
+    status = path.stat()
+    if os.name != "posix":
+        return
+    if status.st_uid not in (os.getuid(), 0):
+        raise TransportError(f"{path}: belongs to another user (uid {status.st_uid}); make one of your own")
+    found = stat.S_IMODE(status.st_mode)
+    if found & 0o077:
+        raise TransportError(f"{path}: mode {found:04o} lets other users at it; run `chmod {mode:03o} {path}`")
+
+
+def start_authenticator(context: zmq.Context[zmq.Socket[bytes]], keys: Keys, refusals: Refusals) -> ThreadAuthenticator:
     """Returns a running authenticator that lets in exactly `keys.allowed_clients`. Start it before binding; stop it."""
     authenticator = ThreadAuthenticator(context)
     authenticator.start()
-    authenticator.configure_curve_callback(domain=ZAP_DOMAIN, credentials_provider=_AllowList(keys.allowed_clients))
+    allowed = _AllowList(keys.allowed_clients, refusals)
+    authenticator.configure_curve_callback(domain=ZAP_DOMAIN, credentials_provider=allowed)
     return authenticator
 
 
@@ -120,46 +160,60 @@ def secure_client(socket: zmq.Socket[bytes], keys: Keys) -> None:
     socket.curve_secretkey = keys.client_secret
 
 
-class HandshakeWatch:
-    """Notices that a server refuses us: the socket itself would retry in silence for ever."""
-
-    def __init__(self, socket: zmq.Socket[bytes], address: str) -> None:
-        self._address = address
-        self._socket = socket
-        self._monitor: zmq.Socket[bytes] = socket.get_monitor_socket(_REFUSED_EVENTS)
-
-    def check(self) -> None:
-        """Raises TransportError if a handshake failed since the last call."""
-        refused = False
-        while self._monitor.poll(0):
-            recv_monitor_message(self._monitor)
-            refused = True
-        if refused:
-            raise TransportError(f"{self._address}: authentication refused; are the keys those of this run?")
-
-    def close(self) -> None:
-        """Ends the watch; call it before the socket is closed."""
-        self._socket.disable_monitor()
-
-
 class _AllowList:
     """The callback that the authenticator asks: it hands over keys that are Z85-encoded already."""
 
-    def __init__(self, allowed: frozenset[bytes]) -> None:
+    def __init__(self, allowed: frozenset[bytes], refusals: Refusals) -> None:
         self._allowed = allowed
+        self._refusals = refusals
 
     def callback(self, domain: str, key: bytes) -> bool:
-        return domain == ZAP_DOMAIN and key in self._allowed
+        if domain == ZAP_DOMAIN and key in self._allowed:
+            return True
+        self._refusals.count("key", f"the client key {key.decode('ascii', 'replace')} is not in allowed_clients")
+        return False
+
+
+def _write_keys(folder: Path, lines: dict[str, bytes]) -> None:
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not any(folder.iterdir()):
+            folder.chmod(0o700)  # an empty folder that was there already
+        check_private(folder, 0o700)
+        for name, line in lines.items():
+            descriptor = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(line + b"\n")
+    except FileExistsError as error:
+        raise TransportError(
+            f"{error.filename}: exists already; give another folder, or remove the old keys"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise TransportError(f"{folder}: keys cannot be written there: {_reason(error)}") from error
 
 
 def _read_keys(path: Path) -> list[bytes]:
+    """Returns the keys of a file, one or more."""
     try:
-        mode = stat.S_IMODE(path.stat().st_mode)
-        if os.name == "posix" and mode & 0o077:
-            raise TransportError(f"{path}: mode {mode:04o} lets others at the key; run `chmod 600 {path}`")
-        keys = path.read_bytes().split()
-    except OSError as error:
-        raise TransportError(f"{path}: {error.strerror}; make keys with `apex-bat keys {path.parent}`") from error
-    if not keys or any(len(key) != KEY_CHARACTERS for key in keys):
-        raise TransportError(f"{path}: holds no CURVE key (40 characters a line)")
+        check_private(path, 0o600)
+        with path.open("rb") as file:
+            keys = file.read(MAX_KEY_FILE_BYTES).split()
+    except (OSError, ValueError) as error:
+        raise TransportError(f"{path}: {_reason(error)}; make keys with `apex-bat keys {path.parent}`") from error
+    if not keys or not all(map(_is_key, keys)):
+        raise TransportError(f"{path}: holds no CURVE key (40 characters of Z85 a line)")
     return keys
+
+
+def _is_key(key: bytes) -> bool:
+    """Whether these are 40 characters that stand for 32 bytes."""
+    if len(key) != KEY_CHARACTERS:
+        return False
+    try:
+        return len(z85.decode(key)) == KEY_BYTES
+    except (KeyError, struct.error):  # a character outside Z85, or five that exceed 32 bits
+        return False
+
+
+def _reason(error: OSError | ValueError) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)

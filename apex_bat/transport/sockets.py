@@ -1,28 +1,34 @@
 """Sockets that are bounded in every direction, and the rule of who may listen where.
 
-An `ipc` address must lie in a folder that only its owner can enter; a loopback address is taken as it is; any other
-address needs CURVE keys. Queues, kernel buffers and message sizes are bounded, dead peers are noticed by heartbeats,
-and nothing lingers when a socket is closed.
+An `ipc` address must lie in a folder that only its owner can enter. A TCP address that is not loopback needs CURVE
+keys; a loopback address without them is taken with a warning, because every user of the machine can connect to it.
+Queues, kernel buffers and message sizes are bounded, dead peers are noticed by heartbeats, connections that do not
+introduce themselves are closed, and nothing lingers when a socket is closed.
 """
 
 from __future__ import annotations
 
 import ipaddress
+import logging
 import os
-import stat
+from contextlib import suppress
 from pathlib import Path
 
 import zmq
 
 from apex_bat.config.settings import Transport
+from apex_bat.transport.refusals import Refusals
 from apex_bat.transport.security import (
-    HandshakeWatch,
     Keys,
     TransportError,
+    check_private,
     secure_client,
     secure_server,
     start_authenticator,
 )
+from apex_bat.transport.watching import AcceptWatch, HandshakeWatch
+
+logger = logging.getLogger(__name__)
 
 MAX_MESSAGE_BYTES = Transport().max_message_bytes
 HIGH_WATER = 64  # messages queued in each direction of a connection
@@ -32,6 +38,8 @@ HEARTBEAT_TIMEOUT_MS = 3000  # silence after which a peer counts as gone: a pull
 RECONNECT_MS = 50
 RECONNECT_MAX_MS = 1000
 HANDSHAKE_MS = 5000  # a connection that has not introduced itself by then is closed
+BACKLOG = 1024  # connections that wait to be accepted: a burst of strangers fills the usual 100 for a second (measured)
+MAX_FILES = 65_536  # open files that a listening process asks for: each connection, even a silent one, is one
 MAX_IPC_CHARACTERS = 107  # of the path of a Unix socket
 
 Socket = zmq.Socket[bytes]
@@ -40,15 +48,28 @@ Socket = zmq.Socket[bytes]
 class Listener:
     """A bound socket with a context of its own, and the authenticator of that context.
 
+    Args:
+        kind: of socket, such as zmq.ROUTER.
+        address: where to listen, see `check_address`; port 0 takes any free one.
+        refusals: where refused connections are counted.
+        keys: CURVE keys.
+        max_message_bytes: a peer that announces a larger message is disconnected before memory is taken for it.
+        high_water: messages queued in each direction of a connection.
+        options: further options of ZeroMQ.
+
     Attributes:
         socket: the socket.
         address: where it really listens; a port given as 0 is filled in.
+
+    Raises:
+        TransportError: the address cannot be used, with the reason.
     """
 
     def __init__(
         self,
         kind: int,
         address: str,
+        refusals: Refusals | None = None,
         *,
         keys: Keys | None = None,
         max_message_bytes: int = MAX_MESSAGE_BYTES,
@@ -56,9 +77,13 @@ class Listener:
         options: dict[int, int] | None = None,
     ) -> None:
         check_address(address, keys)
+        raise_file_limit()
+        refusals = refusals or Refusals(logger)
         self._context: zmq.Context[Socket] = zmq.Context()
-        self._authenticator = start_authenticator(self._context, keys) if keys else None
+        self._authenticator = start_authenticator(self._context, keys, refusals) if keys else None
         self.socket: Socket = self._context.socket(kind)
+        self._watch: AcceptWatch | None = AcceptWatch(self.socket, refusals)
+        self._num_ended = 0
         try:
             _bound(self.socket, address, max_message_bytes, high_water, options)
             if keys:
@@ -68,8 +93,17 @@ class Listener:
             self.close()
             raise
 
+    @property
+    def num_ended(self) -> int:
+        """Connections that were open and ended, see `AcceptWatch`."""
+        return self._num_ended if self._watch is None else self._watch.num_ended
+
     def close(self) -> None:
         """Closes socket, authenticator and context; may be called twice."""
+        if self._watch is not None:
+            self._watch.close()
+            self._num_ended = self._watch.num_ended
+            self._watch = None
         self.socket.close(linger=0)
         if self._authenticator is not None:
             self._authenticator.stop()
@@ -100,10 +134,9 @@ class Connection:
         self._context: zmq.Context[Socket] = zmq.Context()
         self.socket: Socket = self._context.socket(kind)
         _bound(self.socket, address, max_message_bytes, high_water, options)
-        self._watch: HandshakeWatch | None = None
+        self._watch: HandshakeWatch | None = HandshakeWatch(self.socket, address)
         if keys:
             secure_client(self.socket, keys)
-            self._watch = HandshakeWatch(self.socket, address)
         try:
             self.socket.connect(address)
         except zmq.ZMQError as error:
@@ -111,7 +144,7 @@ class Connection:
             raise TransportError(f"{address}: cannot connect: {error.strerror}") from error
 
     def check(self) -> None:
-        """Raises TransportError if the server refused our keys."""
+        """Raises TransportError if the server has refused us."""
         if self._watch is not None:
             self._watch.check()
 
@@ -150,6 +183,8 @@ def check_address(address: str, keys: Keys | None, *, listening: bool = True) ->
             f"{address}: not a loopback address, so it needs CURVE keys; "
             "make them with `apex-bat keys FOLDER` and set transport.keys"
         )
+    if keys is None and listening:
+        logger.warning("%s: every user of this machine can connect; use transport.host=ipc or transport.keys", address)
 
 
 def is_loopback(host: str) -> bool:
@@ -160,13 +195,25 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
+def raise_file_limit() -> None:
+    """Asks for as many open files as the system allows, up to MAX_FILES; does nothing where there is no such limit."""
+    if os.name != "posix":
+        return
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MAX_FILES if hard == resource.RLIM_INFINITY else min(MAX_FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with suppress(OSError, ValueError):  # a system that allows less than it says
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
 def _check_folder(folder: Path) -> None:
+    """Refuses a folder of sockets that others may enter: who can enter it can connect."""
     try:
-        status = folder.stat()
+        check_private(folder, 0o700)
     except OSError as error:
         raise TransportError(f"{folder}: no folder for sockets: {error.strerror}") from error
-    if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
-        raise TransportError(f"{folder}: other users may enter this folder of sockets; run `chmod 700 {folder}`")
 
 
 def _bound(
@@ -182,6 +229,7 @@ def _bound(
         zmq.HEARTBEAT_IVL: HEARTBEAT_MS,
         zmq.HEARTBEAT_TIMEOUT: HEARTBEAT_TIMEOUT_MS,
         zmq.HANDSHAKE_IVL: HANDSHAKE_MS,
+        zmq.BACKLOG: BACKLOG,
         zmq.RECONNECT_IVL: RECONNECT_MS,
         zmq.RECONNECT_IVL_MAX: RECONNECT_MAX_MS,
         zmq.IPV6: int("[" in address),  # switched on for all, it would show 127.0.0.1 as ::ffff:127.0.0.1

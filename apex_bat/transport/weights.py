@@ -4,6 +4,9 @@ One message is one part, because the subscribers conflate: of all that has arriv
 The age of what a subscriber finds was 2.3 ms so, against 4.5 s with a queue of 1,000 (medians, measured). A plain PUB
 sends nothing to late subscribers; an XPUB sees each subscription come, and the newest weights are sent once more.
 They are also sent again after a silence: a queue that is full (a subscriber stopped, a cable out) drops what is new.
+
+A publisher listens too. Subscribers may send nothing but the subscription to everything; libzmq keeps all others that a
+stranger makes up, so the socket is opened anew before they fill the memory.
 """
 
 from __future__ import annotations
@@ -25,6 +28,10 @@ logger = logging.getLogger(__name__)
 
 HIGH_WATER = 4  # broadcasts queued for one slow subscriber; older ones are of no use
 REPEAT_S = 2.0  # silence after which the newest weights are sent again
+LEAST_REPEAT_S = 0.1  # between two broadcasts for late subscribers: who subscribes all the time must not load the rest
+AT_ONCE = 100  # notices looked at by one call
+MAX_NOTICE_BYTES = 1024  # of what a subscriber sends: handshakes have 200 to 400, a subscription 1
+MAX_STRANGE = 256  # subscriptions to something else until the socket is opened anew; each may hold 1 KB, 40 in libzmq
 
 
 class WeightsPublisher:
@@ -38,6 +45,7 @@ class WeightsPublisher:
 
     Attributes:
         address: where it listens.
+        refusals: counts of refused connections, subscriptions and messages by reason.
 
     Raises:
         TransportError: the address cannot be used.
@@ -51,12 +59,16 @@ class WeightsPublisher:
         generation: int = 0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        options: dict[int, int] = {zmq.XPUB_VERBOSE: 1}  # every subscription is told, not only the first
-        self._listener = Listener(zmq.XPUB, address, keys=keys, high_water=HIGH_WATER, options=options)
+        self.refusals = Refusals(logger, clock)
+        self._keys = keys
         self._generation = generation
         self._clock = clock
         self._newest: bytearray | None = None
         self._sent_s = clock()
+        self._repeated_s = float("-inf")
+        self._is_wanted = False
+        self._num_strange = 0
+        self._listener = self._open(address)
         self.address = self._listener.address
 
     def publish(self, version: int, learner_step: int, arrays: Mapping[str, NDArray[np.float32]]) -> None:
@@ -72,17 +84,54 @@ class WeightsPublisher:
         self._send()
 
     def serve(self) -> None:
-        """Sends the newest weights again if somebody has subscribed, or after a silence. Call it often."""
-        is_new = self._clock() - self._sent_s >= REPEAT_S
-        while self._listener.socket.poll(0):
-            notice = self._listener.socket.recv(zmq.NOBLOCK)
-            is_new |= notice[:1] == b"\x01"
-        if is_new:
+        """Sends the newest weights again if somebody has subscribed, or after a silence. Call it often.
+
+        Raises:
+            TransportError: the socket had to be opened anew, and could not.
+        """
+        for _ in range(AT_ONCE):
+            if not self._listener.socket.poll(0):
+                break
+            self._take(self._listener.socket.recv_multipart(zmq.NOBLOCK))
+        if self._num_strange > MAX_STRANGE:
+            self._reopen()
+        now_s = self._clock()
+        if now_s - self._sent_s >= REPEAT_S or (self._is_wanted and now_s - self._repeated_s >= LEAST_REPEAT_S):
+            self._repeated_s = now_s
+            self._is_wanted = False
             self._send()
 
     def close(self) -> None:
         """Closes the socket; may be called twice."""
         self._listener.close()
+
+    def _open(self, address: str) -> Listener:
+        options: dict[int, int] = {zmq.XPUB_VERBOSE: 1}  # every subscription is told, not only the first
+        return Listener(
+            zmq.XPUB,
+            address,
+            self.refusals,
+            keys=self._keys,
+            max_message_bytes=MAX_NOTICE_BYTES,
+            high_water=HIGH_WATER,
+            options=options,
+        )
+
+    def _reopen(self) -> None:
+        """Forgets all subscriptions. Subscribers connect again by themselves, and say again what they want."""
+        self._listener.close()
+        self._listener = self._open(self.address)
+        self._num_strange = 0
+
+    def _take(self, parts: list[bytes]) -> None:
+        """Looks at a notice: 1 and the topic for a subscription, 0 and the topic for its end."""
+        if parts == [b"\x01"]:
+            self._is_wanted = True
+        elif len(parts) == 1 and parts[0][:1] == b"\x01":
+            self._num_strange += 1
+            self.refusals.count("subscription", f"to {len(parts[0]) - 1} bytes")
+        elif len(parts) != 1 or parts[0][:1] != b"\x00":
+            self.refusals.count("unexpected", f"a message of {len(parts)} parts to a publisher")
 
     def _send(self) -> None:
         if self._newest is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from apex_bat.replay.arrivals import Arrival, Arrivals
 from apex_bat.transport.messages import InsertHeader
 
@@ -78,3 +80,28 @@ def test_a_snapshot_knows_what_was_stored_and_not_what_waited() -> None:
     assert restored.offer(arrival(1, incarnation=2), b"x") == "stored"
     assert restored.offer(arrival(2, incarnation=2), b"x") == "queued"
     assert restored.offer(arrival(9, incarnation=1), b"x") == "superseded"
+
+
+def test_the_bytes_that_wait_are_bounded_over_all_actors() -> None:
+    arrivals = Arrivals(8, max_bytes=100)
+
+    def offer(actor: str, num_bytes: int) -> str:
+        return arrivals.offer(Arrival(InsertHeader(actor, 1, 1, 1, 0, (0,), (9,), (1,)), "", num_bytes), b"peer")
+
+    assert offer("large", 1000) == "queued"  # or it could never be
+    assert offer("b", 10) == "flood"
+    arrivals.settle()
+    assert [offer("b", 60), offer("c", 60), offer("d", 40)] == ["queued", "flood", "queued"]
+    arrivals.settle()
+    assert offer("c", 60) == "queued"
+    assert len(arrivals) == 2
+
+
+def test_the_names_that_are_remembered_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("apex_bat.replay.arrivals.MAX_ACTORS", 3)
+    arrivals = Arrivals(8)
+
+    def offer(actor: str) -> str:
+        return arrivals.offer(Arrival(InsertHeader(actor, 1, 1, 1, 0, (0,), (9,), (1,)), ""), b"peer")
+
+    assert [offer(name) for name in "abcdeaf"] == ["queued", "queued", "queued", "flood", "flood", "held", "flood"]

@@ -117,8 +117,11 @@ def test_it_says_what_the_server_waits_for_and_when_there_is_no_server(
 ) -> None:
     until(lambda: "20 transitions are missing" in reader.waiting, lambda: server.serve(0.01))
     assert reader.next(0.0) is None
+    asked = reader.counters()["reader.asked_again"]
     server.close()
     until(lambda: "no answer from the replay server at ipc" in reader.waiting, lambda: reader.next(0.01))
+    until(lambda: reader.counters()["reader.asked_again"] > asked, lambda: reader.next(0.01))
+    assert "no answer from the replay server at ipc" in reader.waiting, "asking again is no answer"
 
 
 def test_it_goes_on_with_the_next_server_at_the_same_address(
@@ -173,3 +176,15 @@ def test_closing_is_quick_without_a_server(address: str) -> None:
     reader.update(np.array([1]), np.array([1.0], np.float32))
     reader.close()
     reader.close()
+
+
+def test_updates_that_wait_go_together_and_the_last_of_an_item_counts(
+    server: ReplayServer, reader: ReplayReader, make_chunk: MakeChunk, until: Until
+) -> None:
+    server.store.add("a", 0, [make_chunk(10)])
+    until(lambda: server.metrics()["replay.queued_requests"] == 3, lambda: server.serve(0.01))
+    for step, priority in enumerate((0.5, 0.25), start=1):
+        reader.update(np.array([3, 4 + step]), np.full(2, priority, np.float32))
+    until(lambda: server.store.learner_step == 2, lambda: server.serve(0.01))
+    priorities = server.store.buffer.item_arrays()["items"]["priority"]
+    np.testing.assert_allclose(priorities[[3, 5, 6]], [0.25, 0.5, 0.25], rtol=1e-4)

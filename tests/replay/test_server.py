@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
@@ -12,14 +14,17 @@ import zmq
 
 from apex_bat.config.settings import Config
 from apex_bat.experience import Chunk
+from apex_bat.replay.adjusting import change_ratio
 from apex_bat.replay.client import ReplayReader, ReplayWriter
-from apex_bat.replay.metrics import METRICS, READER_METRICS, WRITER_METRICS
+from apex_bat.replay.metrics import METRICS, READER_METRICS, WRITER_METRICS, declared_name
 from apex_bat.replay.server import ReplayServer
+from apex_bat.replay.snapshot import SnapshotError
 from apex_bat.transport.messages import (
     Ack,
     Insert,
     Message,
     PriorityUpdate,
+    RatioChange,
     Report,
     Sample,
     SampleRequest,
@@ -27,9 +32,28 @@ from apex_bat.transport.messages import (
     decode,
     encode,
 )
+from apex_bat.transport.security import TransportError
 
 MakeChunk = Callable[..., Chunk]
 Until = Callable[..., None]
+
+
+@contextmanager
+def serving(server: ReplayServer) -> Iterator[None]:
+    """Serves in a thread while the block lasts."""
+    stop = threading.Event()
+
+    def serve() -> None:
+        while not stop.is_set():
+            server.serve(0.01)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
 
 
 class Peer:
@@ -232,13 +256,30 @@ def test_snapshots_are_made_while_serving_and_a_failed_one_is_told(
         server.close()
 
 
-def test_a_changed_ratio_holds_at_once(server: ReplayServer) -> None:
-    server.change_ratio(2.0)
-    assert server.store.limiter.samples_per_insert == 2.0
+def test_a_ratio_changed_from_outside_holds_at_once(server: ReplayServer) -> None:
+    with serving(server):
+        now = change_ratio(server.address, RatioChange(2.0))
+    assert server.store.limiter.law == (2.0, now.error_buffer)
+    assert server.metrics()["replay.wanted_samples_per_insert"] == 2.0
 
 
-def test_each_metric_is_declared(server: ReplayServer) -> None:
-    assert set(server.metrics()) == set(METRICS)
+def test_a_ratio_that_could_lead_to_a_standstill_is_refused_with_the_reason(server: ReplayServer) -> None:
+    law = server.store.limiter.law
+    with serving(server), pytest.raises(ValueError, match="wait for each other for ever"):
+        change_ratio(server.address, RatioChange(2.0, error_buffer=1.0))
+    assert server.store.limiter.law == law
+
+
+def test_nobody_who_does_not_know_the_generation_changes_the_ratio(server: ReplayServer) -> None:
+    law = server.store.limiter.law
+    with serving(server), pytest.raises(TransportError, match="no answer"):
+        change_ratio(server.address, RatioChange(2.0), generation=7, timeout_s=0.1)
+    assert server.store.limiter.law == law
+
+
+def test_each_metric_is_declared(server: ReplayServer, make_chunk: MakeChunk) -> None:
+    server.store.add("a", 0, [make_chunk(10)])
+    assert {declared_name(name) for name in server.metrics()} == set(METRICS)
     writer, reader = ReplayWriter(server.address, "a", 8), ReplayReader(server.address, 16, 2)
     try:
         assert set(writer.counters()) == set(WRITER_METRICS)
@@ -246,3 +287,43 @@ def test_each_metric_is_declared(server: ReplayServer) -> None:
     finally:
         writer.close()
         reader.close()
+
+
+def test_a_request_for_another_batch_than_the_settings_give_is_refused(
+    server: ReplayServer, peer: Peer, make_chunk: MakeChunk, until: Until
+) -> None:
+    peer.send(insert(make_chunk, 1), insert(make_chunk, 2), SampleRequest(1, 65_536, 2**61))
+    until(lambda: server.refusals.get("batch_size"), lambda: server.serve(0.01))
+    assert server.metrics()["replay.queued_requests"] == 0
+    assert server.store.learner_step == 0, "and what it says of the learner is not believed"
+
+
+def test_more_or_fewer_parts_than_one_are_refused(server: ReplayServer, make_chunk: MakeChunk, until: Until) -> None:
+    good = bytes(encode(insert(make_chunk, 1)))
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    try:
+        for kind, parts in ((zmq.DEALER, [good, good]), (zmq.REQ, [good])):
+            socket = context.socket(kind)
+            socket.connect(server.address)
+            socket.send_multipart(parts)
+        until(lambda: server.refusals.get("parts") == 2, lambda: server.serve(0.01))
+        assert server.metrics()["replay.size"] == 0
+    finally:
+        context.destroy(linger=0)
+
+
+@pytest.mark.parametrize(
+    "lie", [{"sequences": 3}, {"counts": {}}, {"limiter": [1]}, {"actors": None}, {"generator": {}}]
+)
+def test_a_snapshot_with_a_state_that_lies_is_refused(
+    server: ReplayServer, config: Config, lie: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = server._state()
+    monkeypatch.setattr(server, "_state", lambda: state | lie)
+    server.save()
+    other = ReplayServer(config, "tcp://127.0.0.1:0", np.random.default_rng(0), tmp_path / "replay")
+    try:
+        with pytest.raises(SnapshotError):
+            other.restore()
+    finally:
+        other.close()

@@ -10,6 +10,7 @@ import pytest
 
 from apex_bat.config.settings import Config
 from apex_bat.experience import Chunk
+from apex_bat.replay.metrics import PRIORITY_BINS, SHARED_ACTORS
 from apex_bat.replay.store import RefusedChunkError, ReplayStore
 
 MakeChunk = Callable[..., Chunk]
@@ -132,3 +133,38 @@ def test_without_action_memory_the_learner_sees_no_actions(config: Config, make_
         batch = filled(settings, make_chunk, (1.0, 1.0)).sample(100, 0)
         assert bool(batch.states.actions.any()) == expected
         assert bool(batch.next_states.actions.any()) == expected
+
+
+def test_the_histogram_of_the_priorities_shows_where_they_lie(config: Config, make_chunk: MakeChunk) -> None:
+    store = filled(config, make_chunk, (0.0, 1.0, 1.0, 1e9))
+    histogram = {name: share for name, share in store.metrics().items() if name.startswith("replay.priority_hist.")}
+    assert list(histogram.values()) == [
+        pytest.approx({0: 0.25, 12: 0.5, 15: 0.25}.get(k, 0.0)) for k in range(PRIORITY_BINS)
+    ]
+
+
+def test_the_shares_of_an_actor_whose_priorities_stand_out_differ(config: Config, make_chunk: MakeChunk) -> None:
+    store = filled(with_replay(config, alpha=1.0), make_chunk, (1.0, 3.0))
+    for _ in range(10):
+        store.sample(1000, 0)
+    metrics = store.metrics()
+    assert metrics["replay.inserted_share.actor1"] == 0.5
+    assert metrics["replay.sampled_share.actor1"] == pytest.approx(0.75, abs=0.01)
+
+
+def test_only_the_actors_sampled_most_are_named(config: Config, make_chunk: MakeChunk) -> None:
+    store = filled(with_replay(config, capacity=1000), make_chunk, (0.0,) * SHARED_ACTORS + (9.0,))
+    store.sample(1000, 0)
+    named = [name for name in store.metrics() if name.startswith("replay.sampled_share.")]
+    assert len(named) == SHARED_ACTORS
+    assert named[0] == f"replay.sampled_share.actor{SHARED_ACTORS}"
+
+
+def test_a_law_that_was_changed_holds_on_after_a_restore(config: Config, make_chunk: MakeChunk) -> None:
+    store = filled(config, make_chunk, (1.0, 1.0, 1.0))
+    store.limiter.change(2.0)
+    store.limiter.count_sample(5)
+    other = ReplayStore(config, np.random.default_rng(1))
+    other.restore(store.state())
+    assert other.limiter.law == store.limiter.law
+    assert other.limiter.balance == store.limiter.balance

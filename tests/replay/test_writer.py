@@ -70,7 +70,7 @@ def test_a_slow_server_stops_a_fast_actor_and_loses_nothing(
             lambda: server.serve(0.01),
             lambda: writer.poll(0.0),
         )
-        server.change_ratio(0.001, 1000.0)
+        server.store.limiter.change(0.001, 1000.0)
         until(lambda: not writer.unacknowledged, lambda: server.serve(0.01), lambda: writer.poll(0.0))
         assert writer.acknowledged == sent == server.metrics()["replay.inserted"]
         assert writer.waiting == ""
@@ -224,3 +224,27 @@ def test_an_actor_always_chooses_the_same_of_several_servers(free_running: Confi
             writer.close()
         for server in servers:
             server.close()
+
+
+def test_what_a_server_said_before_it_fell_silent_is_no_longer_the_reason(
+    config: Config, address: str, make_chunk: MakeChunk, until: Until
+) -> None:
+    now_s = [0.0]
+    writer = ReplayWriter(address, "a", window_chunks=4, resend_s=2.0, clock=lambda: now_s[0])
+    server = serving(config, address)
+    try:
+
+        def held_back() -> bool:
+            server.serve(0.01)
+            if writer.has_room:
+                writer.send([make_chunk(10)], 0)
+            writer.poll(0.01)
+            return "actors wait for the learner" in writer.waiting
+
+        until(held_back)
+        now_s[0] += 2.5
+        writer.poll(0.0)
+        assert writer.waiting == ""
+    finally:
+        server.close()
+        writer.close()

@@ -18,6 +18,8 @@ from apex_bat.transport.messages import (
     Message,
     MessageError,
     PriorityUpdate,
+    Ratio,
+    RatioChange,
     Report,
     Sample,
     SampleRequest,
@@ -65,6 +67,8 @@ MESSAGES: list[Message] = [
     SampleRequest(1, 512, 9),
     Sample(1, batch()),
     PriorityUpdate(4, np.arange(3), np.array([0.5, -1.0, 2.0], np.float32)),
+    RatioChange(2.5),
+    Ratio(2.5, 800.0, "because"),
     Weights(3, 75, {"a.weight": np.ones((2, 3), np.float32), "a.bias": np.zeros((), np.float32)}),
     Report("actor", 77, "host", "ipc:///x", "flying", {"steps_per_s": 1.5}),
 ]

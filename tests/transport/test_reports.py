@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import time
 
+import msgspec
+import pytest
 import zmq
 
-from apex_bat.transport.messages import Report
+from apex_bat.transport.messages import Report, Waiting, encode
 from apex_bat.transport.reports import ReportCollector, Reporter
 from apex_bat.transport.sockets import Connection
 
@@ -59,4 +61,27 @@ def test_nonsense_is_refused_and_the_next_report_arrives() -> None:
     finally:
         stranger.close()
         reporter.close()
+        collector.close()
+
+
+def test_a_flood_is_refused_by_reason_and_a_poll_still_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("apex_bat.transport.reports.AT_ONCE", 4)
+    collector = ReportCollector("tcp://127.0.0.1:0", generation=7, roles=["actor-0"])
+    stranger = Connection(zmq.PUSH, collector.address)
+    expected = {"foreign": 2, "parts": 1, "unexpected": 1, "role": 1, "generation": 1}
+    try:
+        stranger.socket.send(b"no message of ours at all")
+        stranger.socket.send(b"nor is this, whatever it says")
+        stranger.socket.send_multipart([b"one", b"two"])
+        stranger.socket.send(encode(Waiting("for nobody"), 7))
+        stranger.socket.send(encode(msgspec.structs.replace(report(), role="../../etc/passwd"), 7))
+        stranger.socket.send(encode(msgspec.structs.replace(report(), role="actor-0")))
+        ends_s = time.monotonic() + 10
+        while collector.refusals.counts != expected:
+            assert time.monotonic() < ends_s, collector.refusals.counts
+            before = collector.refusals.total
+            assert collector.poll(0.01) == []
+            assert collector.refusals.total - before <= 4
+    finally:
+        stranger.close()
         collector.close()

@@ -19,6 +19,14 @@ def test_loopback_needs_no_keys(address: str) -> None:
     check_address(address, None)
 
 
+def test_a_loopback_address_that_all_users_can_reach_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    check_address("tcp://127.0.0.1:0", SOME_KEYS)
+    check_address("tcp://127.0.0.1:0", None, listening=False)
+    assert not caplog.records
+    check_address("tcp://127.0.0.1:0", None)
+    assert "every user of this machine can connect" in caplog.text
+
+
 @pytest.mark.parametrize("address", ["tcp://0.0.0.0:0", "tcp://*:0", "tcp://192.168.1.2:80", "tcp://example.org:80"])
 def test_any_other_address_needs_keys(address: str) -> None:
     with pytest.raises(TransportError, match=r"needs CURVE keys.*apex-bat keys"):

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zmq
 from numpy.typing import NDArray
 
 from apex_bat.transport.messages import Weights
 from apex_bat.transport.security import make_keys
-from apex_bat.transport.weights import REPEAT_S, WeightsPublisher, WeightsSubscriber
+from apex_bat.transport.sockets import Connection
+from apex_bat.transport.weights import MAX_NOTICE_BYTES, REPEAT_S, WeightsPublisher, WeightsSubscriber
 
 SHAPES: dict[str, tuple[int, ...]] = {"w": (3, 4), "b": (4,)}
 
@@ -163,3 +165,70 @@ def test_weights_travel_encrypted_to_those_with_keys(tmp_path: Path) -> None:
         friend.close()
         stranger.close()
         publisher.close()
+
+
+def test_strange_subscriptions_are_counted_and_forgotten_and_disturb_nobody(
+    publisher: WeightsPublisher, subscriber: WeightsSubscriber, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("apex_bat.transport.weights.MAX_STRANGE", 3)
+    publisher.publish(1, 1, arrays(1))
+    assert arrival(publisher, subscriber).version == 1
+    address = publisher.address
+    stranger = Connection(zmq.XSUB, address)
+    try:
+        for topic in range(10):
+            stranger.socket.send(b"\x01topic%d" % topic)
+        stranger.socket.send(b"a message")
+        stranger.socket.send(b"\x00topic")
+        ends_s = time.monotonic() + 10
+        while publisher.refusals.counts.get("subscription", 0) < 4 or "unexpected" not in publisher.refusals.counts:
+            assert time.monotonic() < ends_s
+            publisher.serve()
+        publisher.publish(2, 2, arrays(2))
+        assert arrival(publisher, subscriber).version == 2  # by a connection made anew, if it has to be
+        assert publisher.address == address
+        assert publisher._num_strange <= 7, "of ten; those before the socket was opened anew are forgotten"
+    finally:
+        stranger.close()
+
+
+def test_who_subscribes_all_the_time_does_not_multiply_the_broadcasts() -> None:
+    now = [0.0]
+    publisher = WeightsPublisher("tcp://127.0.0.1:0", clock=lambda: now[0])
+    subscriber = Connection(zmq.SUB, publisher.address)  # one that keeps all that comes
+    subscriber.socket.setsockopt(zmq.SUBSCRIBE, b"")
+    stranger = Connection(zmq.XSUB, publisher.address)
+    try:
+        ends_s = time.monotonic() + 10
+        publisher.publish(1, 1, arrays(1))
+        while not subscriber.socket.poll(10):
+            assert time.monotonic() < ends_s
+            publisher.serve()
+        for _ in range(50):
+            stranger.socket.send(b"\x01")
+        stranger.socket.send(b"the last")  # counted when all before it have been seen
+        while not publisher.refusals.total:
+            assert time.monotonic() < ends_s
+            publisher.serve()
+        received = 0
+        while subscriber.socket.poll(50):
+            subscriber.socket.recv()
+            received += 1
+        assert received <= 2  # the clock stands: one for all who subscribed, beside the first
+    finally:
+        stranger.close()
+        subscriber.close()
+        publisher.close()
+
+
+def test_a_large_subscription_ends_the_connection(publisher: WeightsPublisher) -> None:
+    stranger = Connection(zmq.XSUB, publisher.address)
+    try:
+        stranger.socket.send(b"\x01" + bytes(MAX_NOTICE_BYTES))
+        ends_s = time.monotonic() + 10
+        while not publisher._listener.num_ended:
+            assert time.monotonic() < ends_s
+            publisher.serve()
+        assert publisher.refusals.total == 0
+    finally:
+        stranger.close()

@@ -1,0 +1,75 @@
+"""Looks through a snapshot of the replay without filling a buffer: whether it is sound, what it holds, and its hash."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from apex_bat.replay.snapshot import MAGIC, PREFIX, VERSION, SnapshotError, previous_of
+
+
+class SnapshotFacts(NamedTuple):
+    """What a sound snapshot holds."""
+
+    path: Path
+    transitions: int
+    inserted: int
+    """Transitions ever inserted."""
+    fits: dict[str, int]
+    """The settings that it was made with."""
+    sha256: str
+    """Of the rows and items, in the order of their places: equal for equal replays."""
+    refused: str
+    """Why a newer snapshot was not taken; empty if this is the newest."""
+
+
+def verify(path: Path) -> SnapshotFacts | None:
+    """Returns the facts of the newest sound snapshot, or of the one before it; None if there is none at all.
+
+    Raises:
+        SnapshotError: there are snapshots, and none is sound.
+    """
+    reasons: list[str] = []
+    for file in (path, previous_of(path)):
+        if not file.exists():
+            continue
+        try:
+            return _verify(file)._replace(refused="; ".join(reasons))
+        except (OSError, SnapshotError) as error:
+            reasons.append(str(error))
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+            reasons.append(f"{file}: its content contradicts itself: {error!r}")
+    if reasons:
+        raise SnapshotError("; ".join(reasons))
+    return None
+
+
+def _verify(path: Path) -> SnapshotFacts:
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        prefix = file.read(PREFIX.size)
+        if len(prefix) < PREFIX.size or not prefix.startswith(MAGIC):
+            raise SnapshotError(f"{path}: not a snapshot of the replay")
+        _, version, header_crc, offset, length = PREFIX.unpack(prefix)
+        if version != VERSION:
+            raise SnapshotError(f"{path}: version {version}; this program reads {VERSION}")
+        if offset + length > size:
+            raise SnapshotError(f"{path}: cut short")
+        file.seek(offset)
+        text = file.read(length)
+        if zlib.crc32(text) != header_crc:
+            raise SnapshotError(f"{path}: its header is damaged")
+        header: dict[str, Any] = json.loads(text)
+        total = hashlib.sha256()
+        for entry in sorted(header["sections"], key=lambda entry: (entry["name"], entry["first"])):
+            file.seek(entry["offset"])
+            data = file.read(entry["bytes"])
+            if zlib.crc32(data) != entry["crc32"]:
+                raise SnapshotError(f"{path}: section {entry['name']} is damaged")
+            total.update(f"{entry['name']} {entry['first']} {entry['bytes']}\n".encode())
+            total.update(data)
+    first, inserted, _ = header["state"]["buffer"]
+    return SnapshotFacts(path, inserted - first, inserted, header["fits"], total.hexdigest(), "")

@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup train test test-slow lint clean
+.PHONY: setup train test test-slow chaos lint clean
 .DEFAULT_GOAL := train
 
 setup: $(VENV)/.installed
@@ -21,6 +21,10 @@ test: setup
 
 test-slow: setup
 	$(BIN)/pytest -m slow --timeout 900
+
+# Ten minutes of training whose roles are killed and stopped all the while: what it costs and loses.
+chaos: setup
+	$(BIN)/python -m benchmarks.chaos
 
 lint: setup
 	$(BIN)/ruff check .

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -127,6 +129,15 @@ def parameter_shapes(network: settings.Network, memory_steps: int) -> dict[str, 
             shapes[f"{name}.{i * layers_apart}.bias"] = (units,)
             inputs = units
     return shapes
+
+
+def part_norms(parameters: Mapping[str, Array]) -> dict[str, float]:
+    """Returns `weights_norm.PART` of each part of the network: the root of the sum of its squared parameters."""
+    squares: dict[str, float] = {}
+    for name, values in parameters.items():
+        part = f"weights_norm.{name.partition('.')[0]}"
+        squares[part] = squares.get(part, 0.0) + float(np.square(values, dtype=np.float64).sum())
+    return {part: math.sqrt(total) for part, total in squares.items()}
 
 
 def _dense(x: Array, layers: list[tuple[Array, Array]]) -> Array:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_bat.experience import ACTION_MEMORY, NO_ACTION, Chunk
+from apex_bat.experience import ACTION_MEMORY, NO_ACTION, NUM_BINS, NUM_EARS, Chunk
+from apex_bat.storage import State
 
 
 class Accumulator:
@@ -19,7 +22,13 @@ class Accumulator:
         self._gammas = discount ** np.arange(num_step + 1, dtype=np.float64)
         self._context = max(memory_steps - 1, ACTION_MEMORY)
         self._chunk_transitions = chunk_transitions
-        self._clear()
+        self._first_step = 0
+        self._next_start = 0  # row of the first step whose transition was not given out yet
+        self._frames: list[NDArray[np.float32]] = []
+        self._actions: list[int] = []
+        self._rewards: list[float] = []
+        self._q_taken: list[float] = []
+        self._next_q_max: list[float] = []
 
     def step(self, frame: NDArray[np.float32], action: int, reward: float, q_taken: float, next_q_max: float) -> None:
         """Takes one step.
@@ -52,17 +61,31 @@ class Accumulator:
         """
         left = len(self._rewards) - self._next_start
         chunk = self._cut(final_frame, left, terminated) if left else None
-        self._clear()
+        self._forget(len(self._rewards))
+        self._first_step = self._next_start = 0
         return chunk
 
-    def _clear(self) -> None:
-        self._first_step = 0
-        self._next_start = 0  # row of the first step whose transition was not given out yet
-        self._frames: list[NDArray[np.float32]] = []
-        self._actions: list[int] = []
-        self._rewards: list[float] = []
-        self._q_taken: list[float] = []
-        self._next_q_max: list[float] = []
+    def state(self) -> State:
+        """Returns the steps that are gathered and not given out, with their context."""
+        rows = len(self._rewards)
+        values = {"first_step": self._first_step, "next_start": self._next_start}
+        frames = np.stack(self._frames) if rows else np.zeros((0, NUM_EARS, NUM_BINS), np.float32)
+        arrays: dict[str, NDArray[Any]] = {
+            "frames": frames,
+            "actions": np.array(self._actions, np.int64),
+            "rewards": np.array(self._rewards, np.float64),
+            "q_taken": np.array(self._q_taken, np.float64),
+            "next_q_max": np.array(self._next_q_max, np.float64),
+        }
+        return State(values, arrays)
+
+    def restore(self, state: State) -> None:
+        """Continues from what `state` returned."""
+        arrays = state.arrays
+        self._first_step, self._next_start = state.values["first_step"], state.values["next_start"]
+        self._frames = list(arrays["frames"])
+        self._actions, self._rewards = arrays["actions"].tolist(), arrays["rewards"].tolist()
+        self._q_taken, self._next_q_max = arrays["q_taken"].tolist(), arrays["next_q_max"].tolist()
 
     def _cut(self, newest_frame: NDArray[np.float32], count: int, terminated: bool) -> Chunk:
         start, steps = self._next_start, len(self._rewards)

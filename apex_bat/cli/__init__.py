@@ -11,7 +11,7 @@ import sys
 import typer
 
 from apex_bat import __version__
-from apex_bat.cli import inspecting, judging, roles, training
+from apex_bat.cli import adjusting, inspecting, judging, roles, training
 from apex_bat.config import ConfigError
 from apex_bat.launching import ONE_THREAD
 
@@ -29,6 +29,7 @@ app.command("train")(training.train)
 app.command("evaluate")(judging.evaluate)
 app.command("inspect")(inspecting.inspect)
 app.command("status")(judging.status)
+app.command("adjust")(adjusting.adjust)
 app.command("arena")(judging.arena)
 app.command("bench")(judging.bench)
 app.command("keys")(roles.keys)
@@ -74,6 +75,7 @@ def _report(error: Exception) -> int:
         "ArenaError": 2,
         "TransportError": 1,
         "RunError": 1,
+        "InUseError": 1,
         "RecordingError": 1,
         "FilmError": 1,
         "ScreenshotError": 1,

@@ -5,65 +5,91 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
+
+from apex_bat.cli.training import Overrides
 
 Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file, for programs.")]
 RunFolder = Annotated[Path, typer.Argument(help="Run folder.")]
 
 
 def evaluate(
-    run: RunFolder,
+    run: Annotated[Path | None, typer.Argument(help="Run folder; none with --policy.")] = None,
     arenas: Annotated[str, typer.Option(help="Arenas, separated by commas. [default: those of the run]")] = "",
     flights: Annotated[int | None, typer.Option(help="Flights in each. [default: that of the run]", min=1)] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the starts. [default: that of the run]", min=0)] = None,
     record: Annotated[int, typer.Option(help="Flights to record in each arena.", min=0)] = 0,
+    policy: Annotated[
+        str, typer.Option(help="A baseline instead of a run: random, straight, ild or oracle.", metavar="BASELINE")
+    ] = "",
+    overrides: Overrides = None,
     json_file: Json = None,
 ) -> None:
-    """Fly the best policy of a run greedily, until 1000 steps or a wall, and print what came of it."""
+    """Fly the best policy of a run greedily, until 1000 steps or a wall, and print what came of it.
+
+    With --set it flies under other settings than it was trained with, for example --set sonar.rendering=exact; the
+    result says which. With --policy and without a run a baseline flies.
+    """
     from apex_bat.cli.training import print_result
+    from apex_bat.config import load
     from apex_bat.evaluation import runs
     from apex_bat.recording.keeping import keep_flights, num_logged
     from apex_bat.simulation.arenas import load_arenas
 
-    config = runs.load_config(run)
+    if (run is None) != bool(policy):
+        raise typer.BadParameter("give a run folder or --policy, one of them", param_hint="RUN")
+    if run is None and record:
+        raise typer.BadParameter("--record writes to a run folder, and --policy has none")
+    if run is not None:
+        runs.load_config(run)  # says so where there is no run
+    config = load(None if run is None else run / "config.toml", overrides or ())
     chosen = [name.strip() for name in arenas.split(",") if name.strip()] or list(config.evaluation.arenas)
     for name in chosen:
         load_arenas(name)
-    result, recorded = runs.evaluate(
-        run, chosen, flights or config.evaluation.flights,
-        config.evaluation.start_seed if seed is None else seed, num_recorded=num_logged(config.recording, record),
-    )  # fmt: skip
+    num_flights = flights or config.evaluation.flights
+    start_seed = config.evaluation.start_seed if seed is None else seed
+    if run is None:
+        from apex_bat.evaluation.results import Protocol, fly_baseline
+
+        result, _ = fly_baseline(policy, config, Protocol(tuple(chosen), num_flights, start_seed))
+    else:
+        result, recorded = runs.evaluate(
+            run, chosen, num_flights, start_seed, num_recorded=num_logged(config.recording, record),
+            overrides=overrides or (),
+        )  # fmt: skip
+        keep_flights(recorded, config, run, num_first=record)
     text = json.dumps(result, indent=1) + "\n"
-    (run / "evaluation" / f"{time.strftime('%Y%m%d-%H%M%S')}.json").write_text(text, encoding="utf-8")
+    if run is not None:
+        (run / "evaluation" / f"{time.strftime('%Y%m%d-%H%M%S')}.json").write_text(text, encoding="utf-8")
     if json_file is not None:
         json_file.write_text(text, encoding="utf-8")
-    keep_flights(recorded, config, run, num_first=record)
     print_result(result, Console())
 
 
 def status(run: RunFolder, json_file: Json = None) -> None:
-    """Tell each role's pid, host, address, restarts, heartbeat and what it does or waits for."""
-    from apex_bat.evaluation.runs import RunError
+    """Tell each role's pid, host, restarts, heartbeat, rate, lag, memory, and what it does or waits for."""
+    from apex_bat.launching.status import figures, read_status
 
-    path = run / "status.json"
-    if not path.exists():
-        raise RunError(f"{run}: no status.json; no run was started here")
-    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    age_s = time.time() - content["written_unix_s"]
-    for row in content["roles"]:
-        if row["heartbeat_age_s"] is not None:
-            row["heartbeat_age_s"] = round(row["heartbeat_age_s"] + age_s, 2)
+    content = read_status(run)
     if json_file is not None:
-        json_file.write_text(json.dumps({"roles": content["roles"]}, indent=1) + "\n", encoding="utf-8")
-    table = Table("role", "pid", "host", "restarts", "heard [s]", "doing", "address", box=None)
+        json_file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    if content["verdict"]:
+        print(content["verdict"])
+    table = Table("role", "pid", "restarts", escape("heard [s]"), "rate", "lag", "memory", "files", box=None)
     for row in content["roles"]:
-        cells = (row[key] for key in ("role", "pid", "host", "restarts", "heartbeat_age_s", "state", "address"))
-        table.add_row(*("-" if cell in (None, "") else str(cell) for cell in cells))
-    Console().print(table)
+        cells = [*(row[key] for key in ("role", "pid", "restarts", "heartbeat_age_s")), *figures(row).values()]
+        table.add_row(*("-" if cell is None else str(cell) for cell in cells))
+    console = Console()
+    console.print(table)
+    for row in content["roles"]:
+        place = " ".join(part for part in (row["host"], row["address"]) if part)
+        text = f" {row['role']}: {row['state']}" + (f" ({place})" if place else "")
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 def arena(

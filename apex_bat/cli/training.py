@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import json
 import logging
-from contextlib import nullcontext, suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
 from apex_bat.config import Config, ConfigError, load
 
+if TYPE_CHECKING:  # `--help` needs none of it
+    from apex_bat.launching.live import View
+    from apex_bat.launching.local import Ended
+    from apex_bat.launching.standing import Origin
+
+_ROLES_END_S = 3.0  # beyond their grace, until the roles of a killed launcher are gone
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="TOML file of settings; those that ship: configs/.")]
 Overrides = Annotated[
     list[str] | None,
@@ -27,6 +34,16 @@ def train(
     run: Annotated[
         Path | None, typer.Option("--run", help="Run folder to make. [default: runs/NAME-DATE-TIME]")
     ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option("--resume", metavar="RUN", help="Go on with this run, with its settings or those of --config."),
+    ] = None,
+    without_replay: Annotated[
+        bool, typer.Option("--without-replay", help="With --resume: begin with an empty replay.")
+    ] = False,
+    serial: Annotated[
+        bool, typer.Option("--serial", help="All roles in this process, in lock step: equal seeds give equal bytes.")
+    ] = False,
     rerun: Annotated[
         bool, typer.Option("--rerun", help="Stream flights and curves to a rerun viewer that is open on this machine.")
     ] = False,
@@ -36,44 +53,121 @@ def train(
 
     Ends at the first of train.max_minutes, train.max_env_steps and train.max_updates. Ctrl-C ends it early, with a last
     checkpoint and snapshot; a second Ctrl-C kills.
+
+    With --resume a run goes on: network, optimiser, counters, random states and replay are restored and checked, and
+    what was restored is said. A run that had reached its limit needs a higher one: --set train.max_minutes=30. Settings
+    that would make another experiment of it are refused. A run begun with --serial goes on to the bit as if it had
+    never stopped.
     """
+    if resume is not None and run is not None:
+        raise typer.BadParameter("--run makes a new run and --resume goes on with one: give one of them")
+    if without_replay and resume is None:
+        raise typer.BadParameter("--without-replay belongs to --resume")
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    console = Console()
+    if resume is None:
+        folder, config = _create(config_file, overrides or (), run, serial=serial)
+    else:
+        folder, config = resume, _settings_of(resume)
+    with _locked(folder, config) as lock:
+        lines: tuple[str, ...] = ()
+        origin, part = None, 0
+        if resume is not None:
+            from apex_bat.launching import resuming
+
+            found = resuming.prepare(folder, config_file, overrides or (), serial=serial, without_replay=without_replay)
+            check(found.config, serial=found.mode == "serial")
+            resuming.apply(folder, found, without_replay=without_replay)
+            config, serial, lines, origin = found.config, found.mode == "serial", found.lines, found.origin
+            part = resuming.num_resumed(folder)
+        mode = ", serial" if serial else ""
+        title = f"apex-bat train: {config.condition} in {config.arena}, seed {config.seed}{mode}, {folder}"
+        for line in (title, *lines):
+            console.print(line, highlight=False, soft_wrap=True)
+        start = _starter(config, folder, serial=serial, origin=origin, part=part, lock=lock)
+        _follow(start, folder, title, console, rerun=rerun, plain=plain)
+    conclude(folder, config, console)
+    return 0
+
+
+def _create(
+    config_file: Path | None, overrides: Sequence[str], run: Path | None, *, serial: bool
+) -> tuple[Path, Config]:
+    """Makes a new run folder; returns it with its settings."""
     from apex_bat.evaluation import runs
+
+    config = load(config_file, overrides)
+    check(config, serial=serial)
+    folder = run or Path("runs") / f"{config_file.stem if config_file else 'default'}-{datetime.now():%Y%m%d-%H%M%S}"
+    runs.create(folder, config, mode="serial" if serial else "asynchronous")
+    return folder, config
+
+
+def _settings_of(run: Path) -> Config:
+    """Returns the settings of a run that is to go on."""
+    from apex_bat.evaluation.runs import load_config
+    from apex_bat.launching.resuming import mode_of
+
+    mode_of(run)  # a folder without run.json holds no run
+    return load_config(run)
+
+
+def _locked(folder: Path, config: Config) -> AbstractContextManager[int | None]:
+    from apex_bat.launching.lock import locked
+    from apex_bat.launching.status import is_launched
+
+    return locked(folder, lambda: is_launched(folder), config.launch.grace_s + _ROLES_END_S)
+
+
+def _starter(
+    config: Config, folder: Path, *, serial: bool, origin: Origin | None, part: int, lock: int | None
+) -> Callable[[View], Ended]:
+    """Returns what trains under a view."""
+    if serial:
+        from apex_bat.launching import serial as mode
+
+        return lambda view: mode.train(config, folder, view, is_resumed=origin is not None)
     from apex_bat.launching import local
+    from apex_bat.launching.standing import NEW_RUN
+
+    return lambda view: local.train(config, folder, view, origin=origin or NEW_RUN, part=part, lock=lock)
+
+
+def _follow(
+    start: Callable[[View], Ended], folder: Path, title: str, console: Console, *, rerun: bool, plain: bool
+) -> None:
+    """Trains, and notes in the run folder how it ended; exits unless it was completed."""
+    from apex_bat.evaluation import runs
     from apex_bat.launching.live import PlainView, view_for
     from apex_bat.recording.streaming import streamer
     from apex_bat.storage import StorageError
 
-    config = load(config_file, overrides or ())
-    check(config)
-    folder = run or Path("runs") / f"{config_file.stem if config_file else 'default'}-{datetime.now():%Y%m%d-%H%M%S}"
-    console = Console()
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
-    runs.create(folder, config)
-    title = f"apex-bat train: {config.condition} in {config.arena}, seed {config.seed}, {folder}"
-    console.print(title, highlight=False, soft_wrap=True)
     view = PlainView(console) if plain else view_for(console, title)
     try:
         with streamer(folder) if rerun else nullcontext():
-            ended = local.train(config, folder, view)
+            ended = start(view)
     except BaseException as error:
         with suppress(StorageError):  # of a full disk, which is then the error at hand
             runs.finish(folder, "failed", reason=str(error) or type(error).__name__)
         raise
     with suppress(StorageError):
         runs.finish(
-            folder, ended.outcome, reason=ended.reason, env_steps=ended.env_steps, learner_steps=ended.learner_steps
-        )
+            folder, ended.outcome, reason=ended.reason, env_steps=ended.env_steps, learner_steps=ended.learner_steps,
+            elapsed_s=round(ended.elapsed_s, 3),
+        )  # fmt: skip
     if ended.outcome == "failed":
         typer.echo(f"apex-bat: {ended.reason}; the logs are in {folder / 'logs'}", err=True)
         raise typer.Exit(1)
     if ended.outcome == "interrupted":
-        typer.echo(f"interrupted; the last checkpoint is in {folder / 'checkpoints'}", err=True)
+        typer.echo(
+            f"interrupted; the last checkpoint is in {folder / 'checkpoints'}; "
+            f"apex-bat train --resume {folder} goes on",
+            err=True,
+        )
         raise typer.Exit(130)
-    conclude(folder, config, console)
-    return 0
 
 
-def check(config: Config) -> None:
+def check(config: Config, *, serial: bool = False) -> None:
     """Refuses settings that no role could work with, before anything is started.
 
     Raises:
@@ -84,6 +178,10 @@ def check(config: Config) -> None:
     from apex_bat.transport.security import load_keys
     from apex_bat.transport.sockets import check_address
 
+    if serial:
+        from apex_bat.launching.serial import settings_of
+
+        settings_of(config)
     if config.replay.shards > 1:
         raise ConfigError(
             f"replay.shards is {config.replay.shards}, and training starts one replay server: set it to 1"
@@ -127,7 +225,8 @@ def print_result(result: dict[str, Any], console: Console) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    title = f"{result['run']}: {result['condition']}, {result['checkpoint']}, update {result['learner_step']}"
+    origin = f"{result['checkpoint']}, update {result['learner_step']}" if result["checkpoint"] else "a baseline"
+    title = "; ".join([f"{result['run']}: {result['condition']}, {origin}", *result.get("changed", ())])
     table = Table(title=title, title_justify="left")
     columns = ("arena", "complete", "steps", "distance [m]", "progress [m]", "straight [%]", "clearance [m]")
     for name in columns:

@@ -222,8 +222,8 @@ class Learner(Section, frozen=True):
     """Arithmetic of the network; bfloat16 by autocast, with float32 parameters, pays on CUDA and at large batches."""
     compile: bool = False
     """Whether torch compiles the network: a minute at the start (and a C++ compiler on a CPU) for a few percent."""
-    prefetch: Annotated[int, Meta(ge=1, le=64)] = 4
-    """Batches asked for ahead. Ape-X 16; each is that much older when it is used."""
+    prefetch: Annotated[int, Meta(ge=1, le=64)] = 16
+    """Batches asked for ahead (Ape-X: up to 16). The learner never waits for one, and each is so much older."""
 
 
 class Exploration(Section, frozen=True):
@@ -361,7 +361,8 @@ class Recording(Section, frozen=True):
     extremes: bool = True
     """Whether the best and the worst of those flights are recorded besides, marked in their names."""
     crashes: CountOrZero = 2
-    """How many further flights of each arena that ended at a wall are recorded besides, marked in their names."""
+    """How many further flights of each arena that ended at a wall are recorded besides, those that flew longest
+    before it, marked in their names."""
     sampled_flights: CountOrZero = 1
     """Flights recorded of each evaluation during training."""
     every_episodes: CountOrZero = 20
@@ -382,11 +383,23 @@ class Launch(Section, frozen=True):
     backoff_s: Positive = 0.2
     """Wait before the first restart of a role; doubles with each quick failure, up to 30 s."""
     max_failures: CountOrZero = 5
-    """Quick failures in a row (each within 60 s) after which a role is given up and the run ends."""
+    """Quick failures in a row after which a role is given up and the run ends."""
+    quick_failure_s: Positive = 20.0
+    """A failure is quick when the role lived shorter than this. It works after 3 to 8 s (measured on two cores)."""
+    start_timeout_s: Positive = 120.0
+    """A new process that has not been heard of for this long is killed and replaced; importing torch takes seconds."""
     heartbeat_timeout_s: Positive = 30.0
-    """A role that has not been heard of for this long is killed and replaced."""
+    """A role that was heard and then not for this long is killed and replaced; each reports every second."""
     grace_s: Positive = 8.0
-    """How long a role may take to end after it was asked to."""
+    """How long a role may take to end after it was asked to, or after the launcher was killed."""
+    stall_s: Positive = 60.0
+    """Time without an environment step or an update after which view, status and log say so, and who waits for whom."""
+    dense_rows_s: Positive = 3600.0
+    """So long each role's metrics get a row a second; then the period grows as elapsed / this, to bound the files."""
+    log_max_mb: Positive = 10.0
+    """Size at which a log is renamed to NAME.log.1 and begun anew (POSIX; elsewhere logs grow)."""
+    log_files: CountOrZero = 3
+    """Former logs kept of each role; 0: none, and the log is emptied instead."""
 
 
 class Config(Section, frozen=True):
@@ -421,6 +434,14 @@ class Config(Section, frozen=True):
     evaluation: Evaluation = Evaluation()
     recording: Recording = Recording()
     launch: Launch = Launch()
+
+    def __post_init__(self) -> None:
+        absent = [number for number in self.recording.actors if number >= self.actors]
+        if absent:
+            raise ValueError(
+                f"recording.actors names actor {absent[0]}, and the {self.actors} actors have the numbers 0 to"
+                f" {self.actors - 1}"
+            )
 
     @property
     def state_steps(self) -> int:

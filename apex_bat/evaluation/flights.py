@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -18,6 +18,21 @@ from apex_bat.simulation.arenas import arena_names
 from apex_bat.simulation.vector import EchoFlightVector
 
 CLEARANCE_QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95)
+
+
+class Pilot(Protocol):
+    """What chooses the actions of all bats of an evaluation: a network, or one of apex_bat.evaluation.baselines."""
+
+    def __call__(self, states: States) -> PolicyValues:
+        """Returns the values of all bats' actions in these states; the action of the greatest q is flown."""
+
+
+@runtime_checkable
+class Sighted(Pilot, Protocol):
+    """A pilot that perceives more than the states."""
+
+    def look(self, env: EchoFlightVector) -> None:
+        """Is shown the environment once, before the first call."""
 
 
 class FlightRecord(Struct, frozen=True):
@@ -50,7 +65,7 @@ class FlightRecord(Struct, frozen=True):
 
 
 def fly(
-    policy: Callable[[States], PolicyValues],
+    policy: Pilot,
     config: Config,
     arena: str,
     *,
@@ -63,7 +78,7 @@ def fly(
     """Flies all flights of one evaluation at once and returns their records, and the first few as recorded flights.
 
     Args:
-        policy: gives Q values; the greatest is taken, without exploration.
+        policy: gives Q values; the greatest is taken, without exploration. One that is `Sighted` is shown the world.
         config: the settings of the run that is judged.
         arena: where to fly.
         num_flights: how many; the same seed gives the same starts to every policy and condition.
@@ -78,6 +93,8 @@ def fly(
     )  # fmt: skip
     try:
         log = _Log(env, config, arena, seed, num_recorded, checkpoint_step)
+        if isinstance(policy, Sighted):
+            policy.look(env)
         observation, _ = env.reset(seed=seed)
         log.begin()
         flying = np.ones(num_flights, bool)

@@ -19,10 +19,11 @@ import numpy as np
 from apex_bat import config as configuration
 from apex_bat.agent.inference import Policy
 from apex_bat.config import Config
+from apex_bat.config.loading import differences
 from apex_bat.evaluation.flights import FlightRecord, fly
 from apex_bat.recording.flight import Flight
 from apex_bat.roles import checkpoint
-from apex_bat.storage import StorageError, write_text
+from apex_bat.storage import StorageError, read_json, write_text
 
 FOLDERS = ("metrics", "checkpoints", "replay", "recordings", "evaluation", "figures", "logs")
 
@@ -31,7 +32,7 @@ class RunError(ValueError):
     """A run folder that is missing, in use, not empty, or cannot be written."""
 
 
-def create(folder: Path, config: Config) -> None:
+def create(folder: Path, config: Config, mode: str = "asynchronous") -> None:
     """Makes a run folder with its settings and the facts of its start.
 
     Raises:
@@ -43,7 +44,8 @@ def create(folder: Path, config: Config) -> None:
         for name in FOLDERS:
             (folder / name).mkdir(parents=True, exist_ok=True)
         write_text(folder / "config.toml", configuration.dumps(config))
-        note(folder, outcome="running", start=_now(), seed=config.seed, host=socket.gethostname(), **_versions())
+        facts = {"start": _now(), "seed": config.seed, "host": socket.gethostname(), **_versions()}
+        note(folder, outcome="running", mode=mode, **facts)
     except (OSError, StorageError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise RunError(f"{folder}: the run folder cannot be written: {reason}; name another with --run") from None
@@ -56,7 +58,7 @@ def note(folder: Path, **facts: Any) -> None:
         StorageError: it cannot be written.
     """
     path = folder / "run.json"
-    known = json.loads(path.read_text()) if path.exists() else {}
+    known = read_json(path) if path.exists() else {}
     write_text(path, json.dumps(known | facts, indent=2) + "\n")
 
 
@@ -100,18 +102,33 @@ def evaluate(
     *,
     num_recorded: int = 0,
     path: Path | None = None,
+    overrides: Sequence[str] = (),
 ) -> tuple[dict[str, Any], list[Flight]]:
     """Flies the best policy of a run and returns the result, ready for JSON, and the recorded flights.
 
+    Args:
+        folder: of the run.
+        arenas: where to fly.
+        num_flights: in each.
+        seed: of the start poses.
+        num_recorded: how many flights of each arena to log whole.
+        path: the checkpoint; None: the best.
+        overrides: changes to the settings that the policy was trained with, as `config.load` takes them.
+
     Raises:
-        RunError: the folder holds no run or no checkpoint.
+        RunError: the folder holds no run or no checkpoint, or the policy does not fit the changed settings.
         StorageError: the checkpoint cannot be read.
+        ConfigError: a change is not allowed.
     """
-    config = load_config(folder)
+    trained = load_config(folder)
+    config = configuration.load(folder / "config.toml", overrides) if overrides else trained
     path = path or best_checkpoint(folder)
     found = checkpoint.load(path)
     policy = Policy(config.network, config.state_steps)
-    policy.load(found.policy_parameters())
+    try:
+        policy.load(found.policy_parameters())
+    except ValueError as error:
+        raise RunError(f"{path}: {error}") from None
     began_s = time.perf_counter()
     records: list[FlightRecord] = []
     summaries: list[dict[str, Any]] = []
@@ -130,6 +147,7 @@ def evaluate(
         "learner_step": found.learner_step,
         "condition": config.condition,
         "rendering": config.sonar.rendering,
+        "changed": differences(trained, config),
         "training": training_facts(folder, config),
         "evaluation_wall_s": round(time.perf_counter() - began_s, 3),
         "summary": summaries,
@@ -141,12 +159,16 @@ def evaluate(
 def training_facts(folder: Path, config: Config) -> dict[str, Any]:
     """Returns what a reader of results wants to know of a run's training: seed, commit, times, size."""
     path = folder / "run.json"
-    known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    known = read_json(path) if path.exists() else {}
     facts = {name: known.get(name) for name in ("commit", "start", "end", "outcome", "env_steps", "learner_steps")}
     facts |= {"seed": config.seed, "actors": config.actors, "bats_per_actor": config.bats_per_actor}
     if facts["start"] and facts["end"]:
-        elapsed = datetime.fromisoformat(str(facts["end"])) - datetime.fromisoformat(str(facts["start"]))
-        facts["wall_s"] = elapsed.total_seconds()
+        try:
+            elapsed = datetime.fromisoformat(str(facts["end"])) - datetime.fromisoformat(str(facts["start"]))
+        except (ValueError, TypeError) as error:
+            raise StorageError(f"{path}: start or end is no time: {error}") from None
+        is_whole = not known.get("resumed")  # else there was a pause
+        facts["wall_s"] = elapsed.total_seconds() if is_whole else known.get("elapsed_s")
     return facts
 
 

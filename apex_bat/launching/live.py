@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 from types import TracebackType
 from typing import Any, Protocol
@@ -18,6 +19,7 @@ from apex_bat.launching.standing import Standing
 from apex_bat.launching.supervisor import Watched
 
 PLAIN_PERIOD_S = 10.0
+DISK_FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
 WIDE = 120
 """Columns from which the figures stand in five pairs a row instead of three."""
 FIGURES_LINES = 9
@@ -66,8 +68,13 @@ class PlainView:
         if standing.now_s < self._due_s:
             return
         self._due_s = standing.now_s + PLAIN_PERIOD_S
-        parts = [f"{name} {value}" for name, value in figures(standing)]
-        self._console.print(", ".join(parts), soft_wrap=True, highlight=False)
+        lines = [f"standstill: {standing.stall}"] if standing.stall else []
+        lines.append(", ".join(f"{name} {value}" for name, value in figures(standing)))
+        try:
+            self._console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
+        except OSError as error:
+            if error.errno not in DISK_FULL:  # a line in a file on a full disk is not worth a run
+                raise
 
 
 class TerminalView:
@@ -93,7 +100,10 @@ class TerminalView:
         for name, value in zip(CURVES, _curve_values(standing), strict=True):
             self._histories[name].take(value, standing.now_s)
         width, height = self._console.size
-        parts: list[RenderableType] = [Panel(_figures(standing, width), title=self._title, title_align="left")]
+        stall = Text(f"standstill: {standing.stall.partition(' (')[0]}", style="yellow") if standing.stall else None
+        parts: list[RenderableType] = [
+            Panel(_figures(standing, width), title=self._title, title_align="left", subtitle=stall)
+        ]
         height -= FIGURES_LINES
         if height >= ROOMY_LINES:
             parts.append(Panel(self._curves(width - 4), title="since the start", title_align="left"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import secrets
 import shutil
 import signal
 import socket
@@ -21,18 +22,24 @@ import msgspec
 from apex_bat.config import Config
 from apex_bat.launching.live import View
 from apex_bat.launching.processes import RoleProcess
-from apex_bat.launching.standing import Standing
+from apex_bat.launching.rows import RowThinner
+from apex_bat.launching.standing import NEW_RUN, Origin, Standing
+from apex_bat.launching.status import STATUS
 from apex_bat.launching.supervisor import RoleFailedError, Supervisor
 from apex_bat.recording.metrics import MetricsWriter
 from apex_bat.recording.training import TrainingRecording
-from apex_bat.roles.plan import Addresses, Role, roles_of
+from apex_bat.roles.logs import launcher_log
+from apex_bat.roles.plan import Addresses, Role, incarnation_of, roles_of
 from apex_bat.roles.process import ADDRESSES
+from apex_bat.roles.resources import began_unix_s, own_resources
 from apex_bat.storage import StorageError, write_text
+from apex_bat.transport.messages import Report
 from apex_bat.transport.reports import ReportCollector
-from apex_bat.transport.security import load_keys
+from apex_bat.transport.security import TransportError, load_keys
 
-STATUS = "status.json"
 STATUS_PERIOD_S = 1.0
+COMPLAINT_PERIOD_S = 60.0
+"""How often a disk that takes nothing is complained of."""
 _MAX_IPC_PATH = 90  # a Unix socket's path holds 107 bytes
 _log = logging.getLogger(__name__)
 
@@ -47,15 +54,33 @@ class Ended(NamedTuple):
     """Why it failed, in one line; empty when it did not."""
     env_steps: int
     learner_steps: int
+    elapsed_s: float
+    """Time in which it flew, in all parts of the run."""
 
 
-def train(config: Config, run: Path, view: View) -> Ended:
-    """Trains in a run folder made by `runs.create` until a limit, Ctrl-C or a role that is given up."""
-    with _terminable(), _addresses(config, run) as addresses:
-        write_text(run / ADDRESSES, msgspec.json.encode(addresses).decode())
+def train(
+    config: Config, run: Path, view: View, *, origin: Origin = NEW_RUN, part: int = 0, lock: int | None = None
+) -> Ended:
+    """Trains in a run folder made by `runs.create` until a limit, Ctrl-C or a role that is given up.
+
+    Args:
+        config: the settings.
+        run: the run folder.
+        view: shows the run.
+        origin: what earlier parts of a resumed run have done.
+        part: how often the run was resumed.
+        lock: file descriptor of the run's lock, for the roles to keep open.
+    """
+    with _terminable(), launcher_log(run, config.launch), _addresses(config, run) as addresses:
+        write_text(run / ADDRESSES, msgspec.json.encode(addresses).decode(), mode=0o600)  # its numbers let one in
         keys = load_keys(Path(config.transport.keys)) if config.transport.keys else None
-        collector = ReportCollector(addresses.reports, keys=keys)
-        launch = _Launch(config, run, collector)
+        collector = ReportCollector(
+            addresses.reports,
+            keys=keys,
+            generation=addresses.reports_generation,
+            roles=[role.name for role in roles_of(config)],
+        )
+        launch = _Launch(config, run, collector, origin, part, lock)
         try:
             with view:
                 outcome, reason = launch.follow(view)
@@ -68,13 +93,19 @@ def train(config: Config, run: Path, view: View) -> Ended:
 class _Launch:
     """The processes of one run and what they report."""
 
-    def __init__(self, config: Config, run: Path, collector: ReportCollector) -> None:
-        self._config, self._run, self._collector = config, run, collector
+    def __init__(
+        self, config: Config, run: Path, collector: ReportCollector, origin: Origin, part: int, lock: int | None
+    ) -> None:
+        self._config, self._run, self._collector, self._part, self._lock = config, run, collector, part, lock
         self._supervisor = Supervisor(roles_of(config), self._start, config.launch)
-        self._standing = Standing(config, time.monotonic())
+        self._standing = Standing(config, time.monotonic(), origin)
         training = TrainingRecording(config, run) if config.recording.curves else None
         self._metrics = MetricsWriter(run / "metrics", training)
-        self._status_due_s = 0.0
+        self._thinner = RowThinner(config.launch.dense_rows_s)
+        self._began_unix_s = began_unix_s(os.getpid())
+        self._status_due_s = self._complaint_due_s = 0.0
+        self._lost_writes = 0
+        self._has_ended = False
 
     def follow(self, view: View) -> tuple[Outcome, str]:
         """Watches the run until it is over."""
@@ -86,13 +117,13 @@ class _Launch:
                 view.show(self._standing, self._supervisor.watched)
         except KeyboardInterrupt:
             return "interrupted", "interrupted"
-        except (RoleFailedError, StorageError) as error:
+        except RoleFailedError as error:
             return "failed", str(error)
         return "completed", ""
 
-    def counters(self) -> tuple[int, int]:
-        """Returns environment steps and updates of the whole run."""
-        return int(self._standing.env_steps), int(self._standing.learner_step)
+    def counters(self) -> tuple[int, int, float]:
+        """Returns environment steps, updates and elapsed seconds of the whole run."""
+        return int(self._standing.env_steps), int(self._standing.learner_step), self._standing.elapsed_s
 
     def end(self) -> None:
         """Stops the roles, the replay last, and kills what outlives its grace."""
@@ -106,13 +137,18 @@ class _Launch:
             for watched in self._supervisor.watched.values():
                 if watched.handle is not None:
                     watched.handle.kill()
+            self._has_ended = True
+            for row in self._thinner.rest():
+                self._append(row)
             with suppress(StorageError):
                 self._write_status()
             self._metrics.close()
 
     def _start(self, role: Role, incarnation: int) -> RoleProcess:
         threads = self._config.train.threads if role.kind == "learner" else 1
-        return RoleProcess(role, self._run, incarnation, threads)
+        return RoleProcess(
+            role, self._run, incarnation_of(self._part, incarnation), threads, int(self._standing.env_steps), self._lock
+        )
 
     def _take_reports(self, timeout_s: float) -> None:
         reports = self._collector.poll(timeout_s)
@@ -120,24 +156,46 @@ class _Launch:
         for report in reports:
             self._standing.take(report, now_s)
             self._supervisor.heard(report.role, report.pid, now_s)
-            self._metrics.append(
-                report, self._standing.elapsed_s, self._standing.env_steps, self._standing.learner_step
-            )
+            row = self._thinner.take(report, self._standing.elapsed_s)
+            if row is not None:
+                self._append(row)
         if now_s >= self._status_due_s:
             self._status_due_s = now_s + STATUS_PERIOD_S
-            self._write_status()
+            self._standing.look(self._supervisor.watched)
+            with self._disk_may_be_full():
+                self._write_status()
+
+    def _append(self, row: Report) -> None:
+        standing = self._standing
+        with self._disk_may_be_full():
+            self._metrics.append(row, standing.elapsed_s, standing.env_steps, standing.learner_step)
+
+    @contextmanager
+    def _disk_may_be_full(self) -> Iterator[None]:
+        """Lets the run go on without what the disk does not take, and says so once a minute."""
+        try:
+            yield
+        except StorageError as error:
+            self._lost_writes += 1
+            if self._standing.now_s >= self._complaint_due_s:
+                self._complaint_due_s = self._standing.now_s + COMPLAINT_PERIOD_S
+                _log.error("%s; training goes on, and %d writes were lost so far", error, self._lost_writes)
 
     def _write_status(self) -> None:
         roles = self._standing.status(self._supervisor.watched)
-        content = {"launcher_pid": os.getpid(), "written_unix_s": time.time(), "roles": roles}
+        content = {
+            "launcher_pid": os.getpid(), "launcher_began_unix_s": self._began_unix_s, "host": socket.gethostname(),
+            "written_unix_s": time.time(), "ended": self._has_ended, "stall": self._standing.stall,
+            "launcher_metrics": own_resources(), "refused_reports": self._collector.refusals.counts.copy(),
+            "progress": self._standing.progress(), "roles": roles,
+        }  # fmt: skip
         write_text(self._run / STATUS, json.dumps(content, indent=1))
 
     def _end(self, names: Sequence[str], grace_s: float) -> None:
         running = self._supervisor.stop(names)
         deadline_s = time.monotonic() + grace_s
         while running and time.monotonic() < deadline_s:
-            with suppress(StorageError):  # a full disk must not keep the roles from ending
-                self._take_reports(0.05)
+            self._take_reports(0.05)
             for watched in running:
                 ended = watched.handle.poll() if watched.handle is not None else None
                 if ended is not None:
@@ -173,7 +231,7 @@ def _addresses(config: Config, run: Path) -> Iterator[Addresses]:
     if config.transport.host != "ipc":
         host, base_port = config.transport.host, config.transport.base_port
         ports = [base_port + i for i in range(3)] if base_port else _free_ports(host, 3)
-        yield Addresses(*(f"tcp://{host}:{port}" for port in ports))
+        yield _with_generations([f"tcp://{host}:{port}" for port in ports])
         return
     folder = run.resolve() / "sockets"
     if len(os.fsencode(folder)) > _MAX_IPC_PATH:
@@ -181,9 +239,15 @@ def _addresses(config: Config, run: Path) -> Iterator[Addresses]:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(mode=0o700)
     try:
-        yield Addresses(*(f"ipc://{folder / name}" for name in ("replay", "weights", "reports")))
+        yield _with_generations([f"ipc://{folder / name}" for name in ("replay", "weights", "reports")])
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _with_generations(endpoints: Sequence[str]) -> Addresses:
+    """Returns the addresses of replay, weights and reports with generations that nobody can guess."""
+    replay, weights, reports = (secrets.randbits(63) for _ in range(3))
+    return Addresses(*endpoints, replay_generation=replay, weights_generation=weights, reports_generation=reports)
 
 
 def _free_ports(host: str, number: int) -> list[int]:
@@ -191,5 +255,8 @@ def _free_ports(host: str, number: int) -> list[int]:
     with ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket()) for _ in range(number)]
         for each in sockets:
-            each.bind((host, 0))
+            try:
+                each.bind((host, 0))
+            except OSError as error:
+                raise TransportError(f"transport.host={host}: cannot listen there: {error.strerror or error}") from None
         return [each.getsockname()[1] for each in sockets]

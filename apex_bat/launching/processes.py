@@ -10,27 +10,54 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from apex_bat.launching import ONE_THREAD
 from apex_bat.launching.supervisor import Exit
 from apex_bat.roles.plan import Role
 
+KILL_TIMEOUT_S = 2.0
+"""How long a killed process is waited for. One that waits for a dead disk or network drive takes longer to go."""
+
 
 class RoleProcess:
     """One role, running as `python -m apex_bat KIND`."""
 
-    def __init__(self, role: Role, run: Path, incarnation: int, num_threads: int) -> None:
-        """Starts it; its output is appended to `logs/NAME.log`."""
+    def __init__(
+        self,
+        role: Role,
+        run: Path,
+        incarnation: int,
+        num_threads: int,
+        flown_steps: int = 0,
+        lock: int | None = None,
+    ) -> None:
+        """Starts it; its output is appended to `logs/NAME.log`.
+
+        Args:
+            role: which.
+            run: the run folder.
+            incarnation: number of this life of the role.
+            num_threads: of numpy's linear algebra and of torch.
+            flown_steps: environment steps of the whole run so far.
+            lock: file descriptor of the run's lock, which the process keeps open as long as it lives.
+
+        Raises:
+            OSError: it cannot be started.
+        """
+        self._role, self._run = role, run
         self._log = run / "logs" / f"{role.name}.log"
         command = [sys.executable, "-m", "apex_bat", role.kind, "--run", str(run), "--leash",
-                   "--number", str(role.number), "--incarnation", str(incarnation)]  # fmt: skip
+                   "--number", str(role.number), "--incarnation", str(incarnation),
+                   "--flown", str(flown_steps)]  # fmt: skip
         environment = os.environ | dict.fromkeys(ONE_THREAD, str(num_threads))
         flags = 0 if os.name == "posix" else subprocess.CREATE_NEW_PROCESS_GROUP  # type: ignore[attr-defined]
         with self._log.open("ab") as output:
             self._process = subprocess.Popen(  # noqa: S603  # our own command
                 command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=environment,
                 start_new_session=os.name == "posix", creationflags=flags,
+                pass_fds=() if lock is None else (lock,),
             )  # fmt: skip
 
     @property
@@ -41,7 +68,10 @@ class RoleProcess:
     def poll(self) -> Exit | None:
         """Returns how it ended, with the last line of its log, or None while it runs."""
         code = self._process.poll()
-        return None if code is None else Exit(code, last_line(self._log))
+        if code is None:
+            return None
+        remove_unfinished(self._run, self._role, self.pid)
+        return Exit(code, last_line(self._log))
 
     def stop(self) -> None:
         """Lets go of the leash."""
@@ -49,10 +79,21 @@ class RoleProcess:
             self._process.stdin.close()
 
     def kill(self) -> None:
-        """Ends it at once and waits for it."""
+        """Ends it at once and waits for it, for a moment; whether it is gone `poll` says."""
         self.stop()
         self._process.kill()
-        self._process.wait()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(KILL_TIMEOUT_S)
+            remove_unfinished(self._run, self._role, self.pid)
+
+
+def remove_unfinished(run: Path, role: Role, pid: int) -> None:
+    """Removes the files that a process was writing when it ended. No recordings: those can be opened and repaired."""
+    patterns = [f"checkpoints/.*.{pid}.part"]
+    patterns += {"replay": ["replay/*.writing"], "evaluator": ["checkpoints/.best.part"]}.get(role.kind, [])
+    for path in (path for pattern in patterns for path in run.glob(pattern)):
+        with suppress(OSError):
+            path.unlink()
 
 
 def last_line(path: Path, tail_bytes: int = 8192) -> str:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
+from typing import Any, NamedTuple
 
 from apex_bat.config import Config
+from apex_bat.launching.progress import Progress
 from apex_bat.launching.supervisor import Watched
 from apex_bat.roles.plan import roles_of
 from apex_bat.transport.messages import Report
@@ -37,15 +38,33 @@ class RoleStanding:
         return default if self.newest is None else self.newest.metrics.get(name, default)
 
 
+class Origin(NamedTuple):
+    """What the earlier parts of a resumed run have done and used up."""
+
+    env_steps: float = 0.0
+    episodes: float = 0.0
+    updates: float = 0.0
+    elapsed_s: float = 0.0
+    """Time in which it flew."""
+
+
+NEW_RUN = Origin()
+"""That of a run which was not resumed."""
+
+
 class Standing:
     """How the run stands at a moment."""
 
-    def __init__(self, config: Config, now_s: float) -> None:
+    def __init__(self, config: Config, now_s: float, origin: Origin = NEW_RUN) -> None:
         self.config = config
+        self._origin = origin
         self.roles = {role.name: RoleStanding() for role in roles_of(config)}
         self.began_s = now_s
         self.now_s = now_s
         self.flying_since_s: float | None = None
+        self.stall = ""
+        """Since when nothing moves and what the roles say of it; empty while the run goes on."""
+        self._progress = Progress(config.launch.stall_s, now_s)
         self._recent: dict[str, deque[tuple[float, float]]] = {
             name: deque(maxlen=_RECENT_REPORTS * config.actors) for name in ("return", "return_greedy")
         }
@@ -56,15 +75,15 @@ class Standing:
             return
         self.roles[report.role].take(report, now_s)
         for name, recent in self._recent.items():
-            if name in report.metrics:
+            if name in report.metrics and report.role.startswith("actor"):  # not the evaluator's much longer flights
                 recent.append((report.metrics[name], report.metrics.get(f"{name}_count", 1.0)))
-        if self.flying_since_s is None and self.env_steps > 0:
+        if self.flying_since_s is None and self.env_steps > self._origin.env_steps:
             self.flying_since_s = now_s
 
     @property
     def env_steps(self) -> float:
         """Environment steps of all bats."""
-        return self._sum("env_steps")
+        return self._origin.env_steps + self._sum("env_steps")
 
     @property
     def env_steps_per_s(self) -> float:
@@ -74,17 +93,17 @@ class Standing:
     @property
     def episodes(self) -> float:
         """Episodes ended."""
-        return self._sum("episodes")
+        return self._origin.episodes + self._sum("episodes")
 
     @property
     def elapsed_s(self) -> float:
-        """Time since the first environment step."""
-        return 0.0 if self.flying_since_s is None else self.now_s - self.flying_since_s
+        """Time since the first environment step; pauses before the run was resumed do not count."""
+        return self._origin.elapsed_s + (0.0 if self.flying_since_s is None else self.now_s - self.flying_since_s)
 
     @property
     def learner_step(self) -> float:
         """Updates of the network."""
-        return self.roles["learner"].gauge("learner_step", 0.0)
+        return self.roles["learner"].gauge("learner_step", self._origin.updates)
 
     def recent(self, name: str) -> float | None:
         """Returns the mean of `return` or `return_greedy` over the newest reports; None before the first."""
@@ -118,6 +137,15 @@ class Standing:
         """Whether a limit is reached."""
         return any(used >= limit for _, used, limit in self.limits)
 
+    def look(self, watched: dict[str, Watched]) -> None:
+        """Looks whether the run moves on; if not, `stall` says so."""
+        self._progress.take(self.env_steps, self.learner_step, self.now_s)
+        self.stall = self._progress.stall(self.status(watched), self.now_s)
+
+    def progress(self) -> dict[str, float]:
+        """Returns what a run that is resumed goes on from, the fields of `Origin`."""
+        return Origin(self.env_steps, self.episodes, self.learner_step, self.elapsed_s)._asdict()
+
     def status(self, watched: dict[str, Watched]) -> list[dict[str, Any]]:
         """Returns each role's standing as `status --json` prints it."""
         return [self._status(name, watched[name]) for name in self.roles]
@@ -125,7 +153,12 @@ class Standing:
     def _status(self, name: str, watched: Watched) -> dict[str, Any]:
         known = self.roles[name]
         report = known.newest
-        state = "ended" if watched.is_done else "starting" if watched.handle is not None else "waiting to be restarted"
+        if watched.is_done:
+            state = "ended"
+        elif watched.handle is not None:
+            state = "starting"
+        else:
+            state = f"waiting to be restarted: {watched.reason}" if watched.reason else "waiting to be started"
         current = report is not None and watched.handle is not None and report.pid == watched.handle.pid
         return {
             "role": name,

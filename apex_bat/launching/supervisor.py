@@ -1,11 +1,13 @@
 """Watching roles and starting them again: the policy, whatever the roles run on.
 
 A role that ends unasked is started again after a backoff that doubles with each quick failure; one that stays silent
-is killed first. A role that fails too often in a row, or says that trying again is useless, ends the run.
+is killed first. A role that fails too often in a row, or says that trying again is useless, ends the run. While the
+machine cannot start a process, the role is tried again for as long as it takes.
 """
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections.abc import Callable, Iterable
 from typing import NamedTuple, Protocol
@@ -15,16 +17,19 @@ from apex_bat.roles.plan import Role
 
 USELESS = 2
 """Exit code by which a role says that starting it again would fail in the same way."""
-QUICK_S = 60.0
 MAX_BACKOFF_S = 30.0
+TEMPORARY = {
+    getattr(errno, name, None) for name in ("EAGAIN", "ENOMEM", "EMFILE", "ENFILE", "ENOSPC", "EDQUOT", "EINTR")
+}
+"""Errors of starting a process that pass by themselves: the machine is out of memory, processes, files or disk."""
 _log = logging.getLogger(__name__)
 
 
 class Exit(NamedTuple):
     """How a role ended."""
 
-    code: int
-    """Exit code; negative: the signal that killed it."""
+    code: int | None
+    """Exit code; negative: the signal that killed it; None: the machine could not start it."""
     detail: str
     """What it said last, for the one line that a person reads."""
 
@@ -59,10 +64,13 @@ class Watched:
         self.restarts = 0
         self.failures_in_a_row = 0
         self.started_s = 0.0
-        self.heard_s = 0.0
+        self.heard_s: float | None = None
+        """When this process was heard last; None before its first report."""
         self.due_s: float | None = None
         """When it is to be started again; None while it runs or when it is done."""
         self.is_done = False
+        self.reason = ""
+        """Why it does not run now; empty while it runs."""
 
 
 class Supervisor:
@@ -112,34 +120,46 @@ class Supervisor:
         return [watched for watched in chosen if watched.handle is not None]
 
     def _begin(self, watched: Watched, now_s: float) -> None:
-        watched.handle = self._start(watched.role, watched.restarts)
-        watched.started_s = watched.heard_s = now_s
-        watched.due_s = None
+        watched.started_s, watched.heard_s, watched.due_s, watched.reason = now_s, None, None, ""
+        try:
+            watched.handle = self._start(watched.role, watched.restarts)
+        except OSError as error:
+            if error.errno not in TEMPORARY:
+                raise RoleFailedError(f"{watched.role.name}: cannot be started: {error.strerror or error}") from error
+            self._fail(watched, Exit(None, error.strerror or str(error)), now_s)
 
     def _check(self, watched: Watched, handle: Handle, now_s: float) -> None:
         ended = handle.poll()
         if ended is None:
-            silent_s = now_s - watched.heard_s
-            if silent_s > self._launch.heartbeat_timeout_s:
-                _log.warning("%s: silent for %.0f s; killed and replaced", watched.role.name, silent_s)
-                handle.kill()
-            return
-        watched.handle = None
-        if ended.code == 0:
-            watched.is_done = True
-            return
-        quick = now_s - watched.started_s < QUICK_S
-        watched.failures_in_a_row = watched.failures_in_a_row + 1 if quick else 1
+            self._check_silence(watched, handle, now_s)
+        else:
+            watched.handle = None
+            watched.is_done = ended.code == 0
+            if not watched.is_done:
+                self._fail(watched, ended, now_s)
+
+    def _check_silence(self, watched: Watched, handle: Handle, now_s: float) -> None:
+        is_new = watched.heard_s is None
+        silent_s = now_s - (watched.started_s if watched.heard_s is None else watched.heard_s)
+        if silent_s > (self._launch.start_timeout_s if is_new else self._launch.heartbeat_timeout_s):
+            what = "not heard since its start" if is_new else "silent"
+            _log.warning("%s: %s for %.0f s; killed and replaced", watched.role.name, what, silent_s)
+            watched.heard_s = now_s  # a process that cannot even be killed is not tried again at each look
+            handle.kill()
+
+    def _fail(self, watched: Watched, ended: Exit, now_s: float) -> None:
+        is_quick = now_s - watched.started_s < self._launch.quick_failure_s
+        watched.failures_in_a_row = watched.failures_in_a_row + 1 if is_quick else 1
         self._judge(watched, ended)
         wait_s = min(self._launch.backoff_s * 2.0 ** (watched.failures_in_a_row - 1), MAX_BACKOFF_S)
-        watched.due_s = now_s + wait_s
+        watched.due_s, watched.reason = now_s + wait_s, describe(ended)
         _log.warning("%s: %s; starts again in %.1f s", watched.role.name, describe(ended), wait_s)
 
     def _judge(self, watched: Watched, ended: Exit) -> None:
         name = watched.role.name
         if ended.code == USELESS:
             raise RoleFailedError(ended.detail or f"{name} cannot work with these settings")
-        if watched.failures_in_a_row > self._launch.max_failures:
+        if watched.failures_in_a_row > self._launch.max_failures and ended.code is not None:
             raise RoleFailedError(
                 f"{name}: given up after {watched.failures_in_a_row} quick failures, the last: {describe(ended)}"
             )
@@ -147,5 +167,8 @@ class Supervisor:
 
 def describe(ended: Exit) -> str:
     """Returns a few words on how a role ended."""
-    how = f"killed by signal {-ended.code}" if ended.code < 0 else f"failed with exit code {ended.code}"
-    return f"{how}: {ended.detail}" if ended.detail and ended.code > 0 else how
+    if ended.code is None:
+        return f"cannot be started: {ended.detail}"
+    if ended.code < 0:
+        return f"killed by signal {-ended.code}"
+    return f"failed with exit code {ended.code}" + (f": {ended.detail}" if ended.detail else "")

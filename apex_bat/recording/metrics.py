@@ -1,21 +1,26 @@
 """The metrics of a run: rows appended to one file a role, TensorBoard events, and the recording of the training.
 
-Each row is a JSON object on a line of its own, written and flushed at once, so that a crash loses nothing. What each
-figure is stands in `apex_bat.roles.metrics`.
+Each row is a JSON object on a line of its own, written at once, whole or not at all, so that neither a crash nor a full
+disk tears one. What each figure is stands in `apex_bat.roles.metrics`.
 """
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import time
+from collections.abc import Callable
 from contextlib import suppress
+from io import FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.proto.summary_pb2 import Summary
 
+from apex_bat.recording.event_file import EventFile
 from apex_bat.storage import StorageError
 from apex_bat.transport.messages import Report
 
@@ -26,13 +31,26 @@ if TYPE_CHECKING:
 class MetricsWriter:
     """Appends the rows of all roles of a run."""
 
-    def __init__(self, folder: Path, training: TrainingRecording | None = None) -> None:
-        """Takes the folder of the files, and what else gets every row."""
-        self._folder, self._training = folder, training
-        self._files: dict[str, TextIO] = {}
+    def __init__(
+        self,
+        folder: Path,
+        training: TrainingRecording | None = None,
+        clock: Callable[[], float] = time.time,
+        open_events: Callable[[str, str], EventsWriter | EventFile] = EventsWriter,
+    ) -> None:
+        """Opens nothing yet.
+
+        Args:
+            folder: of the files.
+            training: what else gets every row.
+            clock: the time that rows and events carry, in seconds.
+            open_events: opens a TensorBoard file from the beginning of its path and the end of its name.
+        """
+        self._folder, self._training, self._clock, self._open_events = folder, training, clock, open_events
+        self._files: dict[str, FileIO] = {}
         (folder / "tensorboard").mkdir(exist_ok=True)
-        # Not SummaryWriter: its thread dies on a full disk, and then its queue of ten blocks the launcher for ever.
-        self._events = EventsWriter(str(folder / "tensorboard" / "events"))
+        self._events: EventsWriter | EventFile | None = None
+        self._num_event_files = 0
 
     def append(self, report: Report, elapsed_s: float, env_steps: float, learner_step: float) -> None:
         """Appends the report of a role with the counters of the whole run.
@@ -46,33 +64,52 @@ class MetricsWriter:
         Raises:
             StorageError: the disk is full.
         """
-        if report.role not in self._files:
-            self._files[report.role] = (self._folder / f"{report.role}.jsonl").open("a", encoding="utf-8")
         row = {
-            "unix_s": round(time.time(), 3), "elapsed_s": round(elapsed_s, 3), "role": report.role, "pid": report.pid,
+            "unix_s": round(self._clock(), 3), "elapsed_s": round(elapsed_s, 3), "role": report.role, "pid": report.pid,
             "env_steps_total": env_steps, "learner_step_total": learner_step, "state": report.state, **report.metrics,
         }  # fmt: skip
-        file = self._files[report.role]
-        try:
-            file.write(json.dumps(row) + "\n")
-            file.flush()
-            self._append_events(report, env_steps)
-        except OSError as error:
-            raise StorageError(f"{file.name}: cannot be written: {error.strerror or error}") from None
         if self._training is not None:
             self._training.take(row)
+        path = self._folder / f"{report.role}.jsonl"
+        try:
+            if report.role not in self._files:
+                self._files[report.role] = path.open("ab", buffering=0)
+            _append_line(self._files[report.role], json.dumps(row))
+            self._append_events(report, env_steps)
+        except OSError as error:
+            raise StorageError(f"{path}: cannot be written: {error.strerror or error}") from None
 
     def _append_events(self, report: Report, env_steps: float) -> None:
         values = [Summary.Value(tag=f"{report.role}/{name}", simple_value=v) for name, v in report.metrics.items()]
-        self._events.write_event(Event(wall_time=time.time(), step=int(env_steps), summary=Summary(value=values)))
-        self._events.flush()
+        try:
+            if self._events is None:
+                # Not SummaryWriter: its thread dies on a full disk, and its queue of ten then blocks us for ever.
+                self._num_event_files += 1
+                suffix = "" if self._num_event_files == 1 else f".{self._num_event_files}"
+                self._events = self._open_events(str(self._folder / "tensorboard" / "events"), suffix)
+            self._events.write_event(Event(wall_time=self._clock(), step=int(env_steps), summary=Summary(value=values)))
+            self._events.flush()
+        except OSError:  # its end may be torn, and what follows a torn event is not read: the next goes to a new file
+            self._events = None
+            raise
 
     def close(self) -> None:
         """Closes all files."""
         for file in self._files.values():
             with suppress(OSError):  # what could not be written was said when it was tried
                 file.close()
-        with suppress(OSError):
-            self._events.close()
+        if self._events is not None:
+            with suppress(OSError):
+                self._events.close()
         if self._training is not None:
             self._training.close()
+
+
+def _append_line(file: FileIO, text: str) -> None:
+    """Appends a line in one piece; what a full disk took of it is cut off again. Raises OSError."""
+    data = text.encode() + b"\n"
+    begin = file.seek(0, os.SEEK_END)
+    if file.write(data) == len(data):
+        return
+    file.truncate(begin)
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -22,6 +22,7 @@ from apex_bat.roles.lines import ExperienceSink, WeightsSource
 from apex_bat.roles.plan import Assignment
 from apex_bat.roles.reporting import Phases, RoleReporter
 from apex_bat.simulation.vector import EchoFlightVector, Observation
+from apex_bat.storage import State, joined, part_of
 from apex_bat.transport.weights import WeightsSubscriber
 
 _WAIT_S = 0.2
@@ -34,11 +35,21 @@ def run_actor(assignment: Assignment) -> None:
     shapes, most = parameter_shapes(config.network, config.state_steps), config.transport.max_message_bytes
     with ExitStack() as stack:
         weights = stack.enter_context(
-            closing(WeightsSubscriber(addresses.weights, shapes, keys=keys, max_message_bytes=most))
-        )
+            closing(
+                WeightsSubscriber(
+                    addresses.weights, shapes, keys=keys, generation=addresses.weights_generation,
+                    max_message_bytes=most,
+                )
+            )
+        )  # fmt: skip
         writer = stack.enter_context(
-            closing(ReplayWriter(addresses.replay, assignment.role.name, config.actor.window_chunks, keys=keys))
-        )
+            closing(
+                ReplayWriter(
+                    addresses.replay, assignment.role.name, config.actor.window_chunks, keys=keys,
+                    generation=addresses.replay_generation,
+                )
+            )
+        )  # fmt: skip
         reporter = stack.enter_context(closing(RoleReporter(assignment)))
         actor = stack.enter_context(closing(Actor(assignment, writer, weights, reporter)))
         while not assignment.stop.is_set():
@@ -70,7 +81,9 @@ class Actor:
         ]
         self._policy = Policy(config.network, config.state_steps)
         self._learner_step = -1
-        self._phases = Phases("simulation", "policy", "gathering")
+        self._parameters: dict[str, NDArray[np.float32]] = {}
+        self._phases = Phases("simulation", "policy", "gathering", clock=assignment.clock)
+        self._flown_before = assignment.flown_steps
         self._num_steps = 0
         self._has_begun = False
         self._observation: Observation
@@ -126,6 +139,47 @@ class Actor:
             self._reporter.gauge(name, value)
         self._reporter.send(state, self._phases)
 
+    def state(self) -> State:
+        """Returns all that the actor continues from, for `restore`; a recording in the making is not part of it."""
+        values = {
+            "learner_step": self._learner_step,
+            "num_steps": self._num_steps,
+            "has_begun": self._has_begun,
+            "generator": self._generator.bit_generator.state,
+            "episode": self._recorder.episode,
+        }
+        parts = {"self": State(values, {"returns": self._returns.copy()}), "reporter": self._reporter.state()}
+        parts["parameters"] = State({}, dict(self._parameters))
+        parts |= {f"accumulator-{bat}": each.state() for bat, each in enumerate(self._accumulators)}
+        if self._has_begun:
+            # The values are kept: some were computed in a smaller batch, which may round otherwise.
+            parts |= {
+                "env": self._env.state(),
+                "values": State({}, {name: array.copy() for name, array in self._values._asdict().items()}),
+            }
+        return joined(parts)
+
+    def restore(self, state: State) -> None:
+        """Continues from what `state` of an actor with the same assignment returned.
+
+        Raises:
+            ValueError: the state does not fit.
+        """
+        values, arrays = part_of(state, "self")
+        self._num_steps, self._has_begun = values["num_steps"], values["has_begun"]
+        self._generator.bit_generator.state = values["generator"]
+        self._recorder.episode = values["episode"]
+        self._returns = arrays["returns"]
+        self._reporter.restore(part_of(state, "reporter"))
+        if values["learner_step"] >= 0:
+            self._load(values["learner_step"], part_of(state, "parameters").arrays)
+        for bat, accumulator in enumerate(self._accumulators):
+            accumulator.restore(part_of(state, f"accumulator-{bat}"))
+        if self._has_begun:
+            self._observation = self._env.restore(part_of(state, "env"))
+            self._values = PolicyValues(**part_of(state, "values").arrays)
+            self._frames = self._env.newest_frames.copy()
+
     def close(self) -> None:
         """Closes the world."""
         self._env.close()
@@ -140,7 +194,8 @@ class Actor:
     def _current_epsilons(self) -> NDArray[np.float64]:
         if self._config.exploration.kind == "ladder":
             return self._epsilons
-        steps = self._num_steps * self._config.bats_per_actor * self._config.actors
+        # The other actors are taken to fly as fast as this one since it was started.
+        steps = self._flown_before + self._num_steps * self._config.bats_per_actor * self._config.actors
         return np.full(self._config.bats_per_actor, annealed(steps, self._config.exploration))
 
     def _gather(
@@ -188,9 +243,12 @@ class Actor:
         weights = self._weights.newest()
         if weights is None:
             return False
-        self._policy.load(weights.arrays)
-        self._learner_step = weights.learner_step
+        self._load(weights.learner_step, weights.arrays)
         return True
+
+    def _load(self, learner_step: int, arrays: dict[str, NDArray[np.float32]]) -> None:
+        self._policy.load(arrays)
+        self._learner_step, self._parameters = learner_step, arrays
 
     def _wait(self, reason: str) -> bool:
         self._reporter.count("waits", 1)

@@ -14,12 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_bat.config import Config
-from apex_bat.storage import StorageError, read_arrays, write_arrays, write_text
+from apex_bat.storage import StorageError, read_arrays, read_json, write_arrays, write_text
 
 KIND = "apex_bat checkpoint 1"
 BEST = "best.npz"
 _NAME = re.compile(r"step-(\d{9})\.npz")
 _log = logging.getLogger(__name__)
+
+
+class _Header(msgspec.Struct):
+    """What stands in the file beside the arrays."""
+
+    learner_step: int
+    fingerprint: dict[str, Any]
+    counters: dict[str, Any]
 
 
 class Checkpoint(NamedTuple):
@@ -71,7 +79,11 @@ def load(path: Path) -> Checkpoint:
         StorageError: the file is missing, torn or not a checkpoint.
     """
     header, arrays = read_arrays(path, KIND)
-    return Checkpoint(int(header["learner_step"]), header["fingerprint"], header["counters"], arrays)
+    try:
+        known = msgspec.convert(header, _Header)
+    except msgspec.ValidationError as error:
+        raise StorageError(f"{path}: not a checkpoint: {error}") from None
+    return Checkpoint(known.learner_step, known.fingerprint, known.counters, arrays)
 
 
 def load_newest(folder: Path) -> Checkpoint | None:
@@ -80,14 +92,18 @@ def load_newest(folder: Path) -> Checkpoint | None:
     Raises:
         StorageError: there are checkpoints, and none of them can be read.
     """
-    paths = find(folder)
-    for path in reversed(paths):
+    reasons: list[str] = []
+    for path in reversed(find(folder)):
         try:
-            return load(path)
+            found = load(path)
         except StorageError as error:
-            _log.warning("%s; the one before it is used", error)
-    if paths:
-        raise StorageError(f"{folder}: none of the {len(paths)} checkpoints can be read")
+            reasons.append(str(error))
+            continue
+        for reason in reasons:
+            _log.warning("%s; an older one is used", reason)
+        return found
+    if reasons:
+        raise StorageError(f"{folder}: none of the {len(reasons)} checkpoints can be read; the newest: {reasons[0]}")
     return None
 
 
@@ -105,9 +121,13 @@ def step_of(path: Path) -> int:
 
 
 def mark_best(folder: Path, path: Path, score: tuple[float, ...]) -> bool:
-    """Keeps a copy of a checkpoint as the best if its score is at least that of the best so far; says whether."""
+    """Keeps a copy of a checkpoint as the best if its score is at least that of the best so far; says whether.
+
+    Raises:
+        StorageError: it could not be written; the best so far is untouched.
+    """
     note = folder / "best.json"
-    if note.exists() and tuple(json.loads(note.read_text())["score"]) > score:
+    if note.exists() and _noted_score(note) > score:
         return False
     beside = folder / ".best.part"
     try:
@@ -115,5 +135,17 @@ def mark_best(folder: Path, path: Path, score: tuple[float, ...]) -> bool:
         beside.replace(folder / BEST)
     except FileNotFoundError:  # it was removed while it was judged
         return False
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise StorageError(f"{folder / BEST}: cannot be written: {error.strerror or error}") from None
     write_text(note, json.dumps({"score": score, "checkpoint": path.name}))
     return True
+
+
+def _noted_score(note: Path) -> tuple[float, ...]:
+    """Returns the score of the best checkpoint so far; the least of all if the note of it is damaged."""
+    try:
+        return tuple(msgspec.convert(read_json(note).get("score"), list[float]))
+    except (StorageError, msgspec.ValidationError) as error:
+        _log.warning("%s: not read, the next checkpoint counts as the best: %s", note, error)
+        return ()

@@ -27,19 +27,20 @@ class EpisodeRecorder:
         settings = assignment.config.recording
         self._every = settings.every_episodes if assignment.role.number in settings.actors else 0
         self._names = arena_names(assignment.config.arena)
-        self._episode = 0
+        self.episode = 0
+        """Number of the present episode of that bat."""
         self._log: FlightLog | None = None
         self._row: dict[str, object] = {}
 
     def begin(self, learner_step: int) -> None:
         """Starts to follow an episode if it is the turn of one."""
-        if self._every == 0 or self._episode % self._every:
+        if self._every == 0 or self.episode % self._every:
             return
         config = self._assignment.config
         name = self._names[self._env.colony.arena_index[self.bat]]
         facts = FlightFacts(
             arena=name, condition=config.condition, kind="training", seed=config.seed,
-            episode=self._episode, actor=self._assignment.role.number, epsilon=self._epsilon,
+            episode=self.episode, actor=self._assignment.role.number, epsilon=self._epsilon,
             checkpoint_step=learner_step, body=config.body,
         )  # fmt: skip
         self._log = FlightLog(facts, config.state_steps, config.recording.heavy_period_steps)
@@ -68,7 +69,7 @@ class EpisodeRecorder:
         """Writes the recording if the episode has ended."""
         if not ended[self.bat]:
             return
-        self._episode += 1
+        self.episode += 1
         if self._log is None:
             return
         from apex_bat.recording.keeping import keep_flights

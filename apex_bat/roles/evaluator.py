@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 import logging
-import math
-import time
-from collections.abc import Mapping
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
 
 from apex_bat.agent.inference import Policy
 from apex_bat.evaluation.flights import fly, score
@@ -17,7 +11,7 @@ from apex_bat.recording.flight import Flight
 from apex_bat.roles import checkpoint
 from apex_bat.roles.plan import Assignment
 from apex_bat.roles.reporting import RoleReporter
-from apex_bat.storage import StorageError
+from apex_bat.storage import State, StorageError, joined, part_of
 
 _log = logging.getLogger(__name__)
 
@@ -39,38 +33,58 @@ class Evaluator:
     flatter the final figures.
     """
 
-    def __init__(self, assignment: Assignment) -> None:
+    def __init__(self, assignment: Assignment, reporter: RoleReporter | None = None) -> None:
+        """Takes the evaluator's part of the run; `reporter` None: one that reports where the assignment says."""
         self._assignment = assignment
         config = assignment.config
         self._config = config
         self._policy = Policy(config.network, config.state_steps)
-        self._reporter = RoleReporter(assignment)
-        self._judged: Path | None = None
-        self._due_s = time.monotonic() + config.evaluation.period_s
+        self._reporter = reporter or RoleReporter(assignment)
+        self._judged = ""  # name of the checkpoint
+        self._due_s = assignment.clock() + config.evaluation.period_s
 
-    def step(self) -> None:
-        """Judges the newest checkpoint if the time has come and it was not judged yet."""
+    def step(self) -> bool:
+        """Judges the newest checkpoint if the time has come and it was not judged yet.
+
+        Returns:
+            False if it was told to stop meanwhile; it has broken off then and is as it was before.
+        """
         if self._reporter.is_due:
             self._reporter.send("waiting for a new checkpoint")
-        if time.monotonic() < self._due_s:
-            return
+        begun_s = self._assignment.clock()
+        if begun_s < self._due_s:
+            return True
         newest = checkpoint.find(self._assignment.run / "checkpoints")[-1:]
-        if not newest or newest[0] == self._judged:
-            return
-        self._due_s = time.monotonic() + self._config.evaluation.period_s
-        self._judge(newest[0])
+        if not newest or newest[0].name == self._judged:
+            return True
+        if not self._judge(newest[0]):
+            return False
+        self._due_s = begun_s + self._config.evaluation.period_s
+        self._judged = newest[0].name
+        return True
+
+    def state(self) -> State:
+        """Returns all that the evaluator continues from, for `restore`."""
+        own = State({"judged": self._judged, "due_s": self._due_s}, {})
+        return joined({"self": own, "reporter": self._reporter.state()})
+
+    def restore(self, state: State) -> None:
+        """Continues from what `state` returned."""
+        values, _ = part_of(state, "self")
+        self._judged, self._due_s = values["judged"], values["due_s"]
+        self._reporter.restore(part_of(state, "reporter"))
 
     def close(self) -> None:
         """Closes the socket."""
         self._reporter.close()
 
-    def _judge(self, path: Path) -> None:
+    def _judge(self, path: Path) -> bool:
+        """Judges a checkpoint; returns False if it was told to stop meanwhile."""
         try:
             found = checkpoint.load(path)
         except StorageError as error:  # removed meanwhile: a newer one will come
             _log.warning("not judged: %s", error)
-            return
-        self._judged = path
+            return True
         self._policy.load(found.policy_parameters())
         config = self._config
         num_sampled = config.recording.sampled_flights
@@ -80,9 +94,12 @@ class Evaluator:
             is_stopped=self._is_stopped,
         )  # fmt: skip
         if not records:
-            return
+            return False
         result = score(records)
-        checkpoint.mark_best(path.parent, path, result)
+        try:
+            checkpoint.mark_best(path.parent, path, result)
+        except StorageError as error:
+            _log.error("the best checkpoint is not kept: %s", error)
         self._reporter.count("evaluations", 1)
         for name, value in (
             ("learner_step", found.learner_step),
@@ -90,11 +107,11 @@ class Evaluator:
             ("progress_m", result[1]),
             ("steps", sum(record.steps for record in records) / len(records)),
             ("return", sum(record.reward for record in records) / len(records)),
-            *part_norms(found.policy_parameters()).items(),
         ):
             self._reporter.gauge(name, value)
         self._reporter.send(f"judged the checkpoint of update {found.learner_step}")
         self._record(flights)
+        return True
 
     def _record(self, flights: list[Flight]) -> None:
         """Records the sampled flights; on a full disk the evaluation counts all the same."""
@@ -111,12 +128,3 @@ class Evaluator:
         if self._reporter.is_due:
             self._reporter.send("flying")
         return self._assignment.stop.is_set()
-
-
-def part_norms(parameters: Mapping[str, NDArray[np.float32]]) -> dict[str, float]:
-    """Returns `weights_norm.PART` of each part of the network: the root of the sum of its squared parameters."""
-    squares: dict[str, float] = {}
-    for name, values in parameters.items():
-        part = f"weights_norm.{name.partition('.')[0]}"
-        squares[part] = squares.get(part, 0.0) + float(np.square(values, dtype=np.float64).sum())
-    return {part: math.sqrt(total) for part, total in squares.items()}

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-import time
 from contextlib import ExitStack, closing
 
 import numpy as np
 import torch
 
 from apex_bat.agent.d3qn import D3QN
+from apex_bat.agent.inference import part_norms
 from apex_bat.config import ConfigError
 from apex_bat.replay.client import ReplayReader
 from apex_bat.roles import checkpoint
@@ -17,7 +17,8 @@ from apex_bat.roles.checkpoint import Checkpoint
 from apex_bat.roles.lines import BatchSource, WeightsSink
 from apex_bat.roles.plan import Assignment
 from apex_bat.roles.reporting import Phases, RoleReporter
-from apex_bat.storage import StorageError
+from apex_bat.storage import State, StorageError, joined, part_of
+from apex_bat.transport.refusals import PUBLISHER_REASONS
 from apex_bat.transport.weights import WeightsPublisher
 
 _log = logging.getLogger(__name__)
@@ -29,12 +30,15 @@ def run_learner(assignment: Assignment) -> None:
     config, addresses, keys = assignment.config, assignment.addresses, assignment.keys()
     agent, version = make_agent(assignment)
     with ExitStack() as stack:
-        publisher = stack.enter_context(closing(WeightsPublisher(addresses.weights, keys=keys)))
+        publisher = stack.enter_context(
+            closing(WeightsPublisher(addresses.weights, keys=keys, generation=addresses.weights_generation))
+        )
         reader = stack.enter_context(
             closing(
                 ReplayReader(
                     addresses.replay, config.learner.batch_size, config.learner.prefetch,
-                    learner_step=agent.num_updates, keys=keys, max_message_bytes=config.transport.max_message_bytes,
+                    learner_step=agent.num_updates, keys=keys, generation=addresses.replay_generation,
+                    max_message_bytes=config.transport.max_message_bytes,
                 )
             )
         )  # fmt: skip
@@ -42,6 +46,8 @@ def run_learner(assignment: Assignment) -> None:
         learner = Learner(assignment, agent, version, reader, publisher, reporter)
         while not (assignment.stop.is_set() or learner.is_done):
             learner.step(_WAIT_S)
+            for reason in PUBLISHER_REASONS:
+                reporter.gauge(f"weights.refused.{reason}", publisher.refusals.counts.get(reason, 0))
         learner.report("writing the last checkpoint")
         learner.save()
 
@@ -54,9 +60,7 @@ def make_agent(assignment: Assignment) -> tuple[D3QN, int]:
         ConfigError: the newest is of another network or other sensing than the settings say.
     """
     config = assignment.config
-    torch.set_num_threads(config.train.threads)
-    torch.manual_seed(config.seed)
-    agent = D3QN(config, device_of(config.device))
+    agent = new_agent(assignment)
     folder = assignment.run / "checkpoints"
     found = checkpoint.load_newest(folder)
     if found is None:
@@ -64,10 +68,17 @@ def make_agent(assignment: Assignment) -> tuple[D3QN, int]:
     if found.fingerprint != checkpoint.fingerprint(config):
         raise ConfigError(f"{folder}: the newest checkpoint is of another network, sensing or condition")
     agent.restore(found.arrays, found.learner_step)
-    state = np.frombuffer(bytes.fromhex(found.counters["torch_random"]), np.uint8).copy()
-    torch.set_rng_state(torch.from_numpy(state))
+    _restore_random_state(found.counters["torch_random"])
     _log.info("continues from the checkpoint of update %d", found.learner_step)
     return agent, int(found.counters["weights_version"])
+
+
+def new_agent(assignment: Assignment) -> D3QN:
+    """Returns an agent that has learned nothing yet; seeds torch's generator, which draws its weights."""
+    config = assignment.config
+    torch.set_num_threads(config.train.threads)
+    torch.manual_seed(config.seed)
+    return D3QN(config, device_of(config.device))
 
 
 class Learner:
@@ -86,9 +97,15 @@ class Learner:
         self._config, self._folder = assignment.config, assignment.run / "checkpoints"
         self._agent, self._version = agent, version
         self._reader, self._publisher, self._reporter = reader, publisher, reporter
-        self._phases = Phases("waiting", "update", "weights", "checkpoint")
-        self._checkpoint_due_s = time.monotonic() + self._config.checkpoint.period_s
+        self._clock = assignment.clock
+        self._phases = Phases("waiting", "update", "weights", "checkpoint", clock=self._clock)
+        self._checkpoint_due_s = self._clock() + self._config.checkpoint.period_s
         self._broadcast()
+
+    @property
+    def num_updates(self) -> int:
+        """Updates made in the whole run."""
+        return self._agent.num_updates
 
     @property
     def is_done(self) -> bool:
@@ -111,7 +128,7 @@ class Learner:
             self._reporter.average("q_mean", update.q_mean)
             if self._agent.num_updates % self._config.learner.weights_period == 0:
                 self._broadcast()
-        if time.monotonic() >= self._checkpoint_due_s:
+        if self._clock() >= self._checkpoint_due_s:
             self._try_save()
         if self._reporter.is_due:
             self.report("learning" if batch is not None else self._reader.waiting)
@@ -121,7 +138,7 @@ class Learner:
         """Reports what the learner does, and its figures."""
         self._reporter.gauge("learner_step", self._agent.num_updates)
         self._reporter.gauge("weights_version", self._version)
-        for name, value in self._reader.counters().items():
+        for name, value in (self._reader.counters() | part_norms(self._agent.weights())).items():
             self._reporter.gauge(name, value)
         self._reporter.send(state, self._phases)
 
@@ -131,11 +148,33 @@ class Learner:
         Raises:
             StorageError: it could not be written; older ones are untouched.
         """
-        counters = {"weights_version": self._version, "torch_random": torch.get_rng_state().numpy().tobytes().hex()}
+        counters = {"weights_version": self._version, "torch_random": _random_state()}
         state = Checkpoint(
             self._agent.num_updates, checkpoint.fingerprint(self._config), counters, self._agent.arrays()
         )
         checkpoint.save(self._folder, state, self._config.checkpoint.keep)
+
+    def state(self) -> State:
+        """Returns all that the learner continues from, for `restore`."""
+        values = {
+            "num_updates": self._agent.num_updates,
+            "weights_version": self._version,
+            "torch_random": _random_state(),
+            "checkpoint_due_s": self._checkpoint_due_s,
+        }
+        return joined({"self": State(values, self._agent.arrays()), "reporter": self._reporter.state()})
+
+    def restore(self, state: State) -> None:
+        """Continues from what `state` returned; broadcasts nothing.
+
+        Raises:
+            ValueError: the state is of another network or optimiser.
+        """
+        values, arrays = part_of(state, "self")
+        self._agent.restore(arrays, values["num_updates"])
+        self._version, self._checkpoint_due_s = values["weights_version"], values["checkpoint_due_s"]
+        _restore_random_state(values["torch_random"])
+        self._reporter.restore(part_of(state, "reporter"))
 
     def _try_save(self) -> None:
         with self._phases.of("checkpoint"):
@@ -147,7 +186,7 @@ class Learner:
                     error,
                     self._config.checkpoint.period_s,
                 )
-        self._checkpoint_due_s = time.monotonic() + self._config.checkpoint.period_s
+        self._checkpoint_due_s = self._clock() + self._config.checkpoint.period_s
 
     def _broadcast(self) -> None:
         with self._phases.of("weights"):
@@ -164,3 +203,12 @@ def device_of(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise ConfigError("device is cuda, and torch finds none; set device=auto or device=cpu")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def _random_state() -> str:
+    """Returns the state of torch's generator, from which dropout draws on a CPU, in hexadecimal digits."""
+    return torch.get_rng_state().numpy().tobytes().hex()
+
+
+def _restore_random_state(digits: str) -> None:
+    torch.set_rng_state(torch.from_numpy(np.frombuffer(bytes.fromhex(digits), np.uint8).copy()))

@@ -6,6 +6,12 @@ Run `python -m apex_bat.roles.metrics > docs/metrics.md` after a change.
 from __future__ import annotations
 
 from apex_bat.replay.metrics import METRICS, READER_METRICS, WRITER_METRICS, Metric
+from apex_bat.transport.refusals import PUBLISHER_REASONS, REASONS
+
+PROCESS_METRICS: dict[str, Metric] = {
+    "process.memory_mb": Metric("MB", "resident memory of the process, of 1e6 bytes"),
+    "process.open_files": Metric("files", "open in the process: files, sockets and pipes"),
+}
 
 ACTOR_METRICS: dict[str, Metric] = {
     "env_steps": Metric("steps", "flown by all bats of this process"),
@@ -23,6 +29,7 @@ ACTOR_METRICS: dict[str, Metric] = {
     "share.policy": Metric("1", "share of the time spent in the network"),
     "share.gathering": Metric("1", "share of the time spent on chunks and sending them"),
     **WRITER_METRICS,
+    **PROCESS_METRICS,
 }
 
 LEARNER_METRICS: dict[str, Metric] = {
@@ -36,11 +43,16 @@ LEARNER_METRICS: dict[str, Metric] = {
     "gradient_norm_count": Metric("updates", "that `gradient_norm` is the mean of"),
     "q_mean": Metric("1", "mean value of the sampled actions"),
     "q_mean_count": Metric("updates", "that `q_mean` is the mean of"),
+    "weights_norm.filters": Metric("1", "Euclidean norm of the parameters of all convolutions"),
+    "weights_norm.value": Metric("1", "the same of the value stream"),
+    "weights_norm.advantage": Metric("1", "the same of the advantage stream"),
     "share.waiting": Metric("1", "share of the time without a batch: the learner's idle share"),
     "share.update": Metric("1", "share of the time spent on updates"),
     "share.weights": Metric("1", "share of the time spent on broadcasts"),
     "share.checkpoint": Metric("1", "share of the time spent on checkpoints"),
+    **{f"weights.refused.{reason}": Metric("messages", REASONS[reason]) for reason in PUBLISHER_REASONS},
     **READER_METRICS,
+    **PROCESS_METRICS,
 }
 
 EVALUATOR_METRICS: dict[str, Metric] = {
@@ -51,15 +63,13 @@ EVALUATOR_METRICS: dict[str, Metric] = {
     "progress_m": Metric("m", "mean net way along the corridor"),
     "steps": Metric("steps", "mean length of a flight"),
     "return": Metric("1", "mean undiscounted return"),
-    "weights_norm.filters": Metric("1", "Euclidean norm of the parameters of all convolutions of that checkpoint"),
-    "weights_norm.value": Metric("1", "the same of the value stream"),
-    "weights_norm.advantage": Metric("1", "the same of the advantage stream"),
+    **PROCESS_METRICS,
 }
 
 DECLARED: dict[str, dict[str, Metric]] = {
     "actor": ACTOR_METRICS,
     "learner": LEARNER_METRICS,
-    "replay": METRICS,
+    "replay": METRICS | PROCESS_METRICS,
     "evaluator": EVALUATOR_METRICS,
 }
 

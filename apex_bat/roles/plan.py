@@ -4,21 +4,30 @@ from __future__ import annotations
 
 import os
 import socket
+import time
+from collections.abc import Callable
 from pathlib import Path
 from threading import Event
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
+import msgspec
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from apex_bat.config import Config
+from apex_bat.storage import StorageError, read_json
 from apex_bat.transport.security import Keys, load_keys
 
 Kind = Literal["replay", "learner", "actor", "evaluator"]
 
 
-class Addresses(Struct, frozen=True, forbid_unknown_fields=True):
-    """ZeroMQ endpoints of a run."""
+_LIVES_OF_A_PART = 1_000_000  # at one restart each 30 s, the longest backoff, a year
+
+Generation = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+
+
+class Endpoints(Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the sockets of a run listen."""
 
     replay: str
     """The replay server binds it; actors insert, the learner samples."""
@@ -26,6 +35,18 @@ class Addresses(Struct, frozen=True, forbid_unknown_fields=True):
     """The learner binds it and broadcasts; actors listen."""
     reports: str
     """The launcher binds it; every role reports."""
+
+
+class Addresses(Endpoints, frozen=True, kw_only=True):
+    """ZeroMQ endpoints of a run and the generation of each."""
+
+    replay_generation: Generation = 0
+    """What every message to and from the replay server repeats. Drawn anew for each start, so that what is left of a
+    former one is refused, and so is a stranger on this machine, who cannot read it: the file has mode 0600."""
+    weights_generation: Generation = 0
+    """The same for the weights; another number, because whoever may listen to them learns it."""
+    reports_generation: Generation = 0
+    """The same for reports."""
 
 
 class Role(NamedTuple):
@@ -51,7 +72,11 @@ class Assignment(NamedTuple):
     stop: Event
     """Set when the role is to end by itself."""
     incarnation: int
-    """Counts the starts of this role in the run, from 0."""
+    """Differs for each start of this role in the run, also after the run was resumed: see `incarnation_of`."""
+    flown_steps: int = 0
+    """Environment steps of the whole run when this role was started, for what runs over the steps of all bats."""
+    clock: Callable[[], float] = time.monotonic
+    """Seconds, never backwards: what periods are measured by. The serial mode has one of simulated time."""
 
     def generator(self) -> np.random.Generator:
         """Returns the role's own random stream, derived from the run's seed, its kind, number and incarnation."""
@@ -78,9 +103,32 @@ class Assignment(NamedTuple):
         return os.getpid()
 
 
+def incarnation_of(part: int, restarts: int) -> int:
+    """Returns the number of a life of a role, which no other life of it has had.
+
+    Args:
+        part: how often the run was resumed before. Counted apart, because a killed launcher may not have noted the
+            last restarts.
+        restarts: how often the role was started before since the run was started or resumed.
+    """
+    return part * _LIVES_OF_A_PART + restarts
+
+
 def roles_of(config: Config) -> list[Role]:
     """Returns the roles of a run in the order in which they start."""
     roles = [Role("replay", 0), Role("learner", 0), *(Role("actor", i) for i in range(config.actors))]
     if config.evaluation.during_training:
         roles.append(Role("evaluator", 0))
     return roles
+
+
+def read_addresses(path: Path) -> Addresses:
+    """Returns the addresses that a launcher wrote.
+
+    Raises:
+        StorageError: the file is missing or damaged.
+    """
+    try:
+        return msgspec.convert(read_json(path), Addresses)
+    except msgspec.ValidationError as error:
+        raise StorageError(f"{path}: torn or corrupted: {error}") from None

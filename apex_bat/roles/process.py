@@ -2,58 +2,108 @@
 
 from __future__ import annotations
 
+import ctypes
 import faulthandler
 import logging
 import os
 import signal
+import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
+from types import FrameType
 
-import msgspec
-
-from apex_bat.config import ConfigError, load
-from apex_bat.roles.plan import Addresses, Assignment, Kind, Role
+from apex_bat.config import Config, ConfigError, load
+from apex_bat.roles.logs import RotatingLog
+from apex_bat.roles.plan import Assignment, Kind, Role, read_addresses
 from apex_bat.storage import StorageError
 from apex_bat.transport.security import TransportError
 
 ADDRESSES = "addresses.json"
 FAILED, USELESS = 1, 2
+INTERRUPTED, TERMINATED = 130, 143
+"""Exit codes of a role that somebody else than its launcher ended, by Ctrl-C or SIGTERM: it is started again."""
+_PR_SET_PDEATHSIG = 1
 _log = logging.getLogger(__name__)
 
 
-def run_process(kind: Kind, number: int, run: Path, incarnation: int, leashed: bool) -> int:
+def run_process(kind: Kind, number: int, run: Path, incarnation: int, leashed: bool, flown_steps: int = 0) -> int:
     """Runs a role until it is told to stop and returns its exit code.
 
     Args:
         kind: which role.
         number: which of its kind.
         run: the run folder, with config.toml and addresses.json.
-        incarnation: how often this role was started before in this run.
-        leashed: whether the end of standard input means stop.
+        incarnation: number of this life of the role, see `plan.incarnation_of`.
+        leashed: whether the end of standard input means stop; then the role writes its log itself.
+        flown_steps: environment steps of the whole run before this start.
 
     Returns:
-        0 when it ended as asked, 1 when it failed, 2 when starting it again would fail in the same way.
+        0 when it ended by itself or by its leash, 1 when it failed, 2 when starting it again would fail in the same
+        way, 130 and 143 when Ctrl-C or SIGTERM ended it.
     """
     faulthandler.enable()
     role = Role(kind, number)
-    logging.basicConfig(level=logging.INFO, format=f"%(asctime)s {role.name} %(levelname)s %(message)s")
-    stop = threading.Event()
+    logging.basicConfig(level=logging.INFO, format=_line_format(role))
+    stop, was_terminated = threading.Event(), threading.Event()
+    _hear_sigterm(stop, was_terminated)
     try:
         config = load(run / "config.toml")
-        addresses = msgspec.json.decode((run / ADDRESSES).read_bytes(), type=Addresses)
-        signal.signal(signal.SIGTERM, lambda *_: stop.set())
+        addresses = read_addresses(run / ADDRESSES)
         if leashed:
-            threading.Thread(target=_hold_leash, args=(stop, config.launch.grace_s), daemon=True).start()
-        _run(Assignment(role, config, run, addresses, stop, incarnation))
+            _write_log(role, run, config)
+            hold_leash(stop, config.launch.grace_s)
+        _run(Assignment(role, config, run, addresses, stop, incarnation, flown_steps))
     except KeyboardInterrupt:
-        return 0
+        return INTERRUPTED
     except (ConfigError, TransportError, StorageError) as error:
         _log.error("%s", str(error).replace("\n", " "))  # one line, for a person
         return USELESS
     except Exception:
         _log.exception("failed")
         return FAILED
-    return 0
+    return TERMINATED if was_terminated.is_set() else 0
+
+
+def hold_leash(stop: threading.Event, grace_s: float) -> None:
+    """Watches standard input in a thread: at its end, the role is asked to stop, and ended by force after its grace.
+
+    The end by force needs nothing of Python, so that a role that is blocked in C code ends too; it leaves in the log
+    where the role was. A stopped process is continued by the kernel when its launcher dies (Linux), or it would stay.
+    """
+    _be_continued_when_orphaned()
+    threading.Thread(target=_watch_leash, args=(stop, grace_s), daemon=True).start()
+
+
+def _watch_leash(stop: threading.Event, grace_s: float) -> None:
+    while os.read(0, 4096):  # not sys.stdin: its lock, held here, would abort the interpreter's end
+        pass
+    faulthandler.dump_traceback_later(grace_s, exit=True)
+    stop.set()
+
+
+def _be_continued_when_orphaned() -> None:
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)
+
+
+def _hear_sigterm(stop: threading.Event, was_terminated: threading.Event) -> None:
+    def terminate(_number: int, _frame: FrameType | None) -> None:
+        was_terminated.set()
+        stop.set()
+
+    signal.signal(signal.SIGTERM, terminate)
+
+
+def _write_log(role: Role, run: Path, config: Config) -> None:
+    handler = RotatingLog(run / "logs" / f"{role.name}.log", config.launch, takes_standard=True)
+    handler.setFormatter(logging.Formatter(_line_format(role)))
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+
+
+def _line_format(role: Role) -> str:
+    return f"%(asctime)s {role.name} %(levelname)s %(message)s"
 
 
 def _run(assignment: Assignment) -> None:
@@ -69,13 +119,3 @@ def _run(assignment: Assignment) -> None:
     _log.info("starts, pid %d", os.getpid())
     run(assignment)
     _log.info("ends")
-
-
-def _hold_leash(stop: threading.Event, grace_s: float) -> None:
-    """Waits for the end of standard input, then gives the role its grace and ends it by force."""
-    while os.read(0, 4096):  # not sys.stdin: its lock, held here, would abort the interpreter's end
-        pass
-    stop.set()
-    timer = threading.Timer(grace_s, os._exit, (FAILED,))
-    timer.daemon = True
-    timer.start()

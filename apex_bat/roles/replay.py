@@ -18,8 +18,9 @@ def run_replay(assignment: Assignment) -> None:
     """Serves until told to stop; restores the newest snapshot first and writes a last one."""
     path = assignment.run / "replay" / SNAPSHOT
     server = ReplayServer(
-        assignment.config, assignment.addresses.replay, assignment.generator(), path, keys=assignment.keys()
-    )
+        assignment.config, assignment.addresses.replay, assignment.generator(), path, keys=assignment.keys(),
+        generation=assignment.addresses.replay_generation,
+    )  # fmt: skip
     reporter = RoleReporter(assignment, assignment.addresses.replay)
     try:
         with suppress(FileNotFoundError):

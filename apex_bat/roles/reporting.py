@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Protocol
 
 from apex_bat.roles.plan import Assignment
+from apex_bat.roles.resources import own_resources
+from apex_bat.storage import State
 from apex_bat.transport.messages import Report
 from apex_bat.transport.reports import Reporter
 
@@ -17,46 +21,76 @@ PERIOD_S = 1.0
 class Phases:
     """Measures which share of the wall time a role spends in each of its phases."""
 
-    def __init__(self, *names: str) -> None:
+    def __init__(self, *names: str, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock = clock
         self._spent_s = dict.fromkeys(names, 0.0)
-        self._since = time.perf_counter()
+        self._since = clock()
 
     @contextmanager
     def of(self, name: str) -> Iterator[None]:
         """Counts the time inside the block to a phase."""
-        begin = time.perf_counter()
+        begin = self._clock()
         try:
             yield
         finally:
-            self._spent_s[name] += time.perf_counter() - begin
+            self._spent_s[name] += self._clock() - begin
 
     def shares(self) -> dict[str, float]:
-        """Returns each phase's share of the time since the last call, as `share.NAME`, and begins anew."""
-        now = time.perf_counter()
+        """Returns each phase's share of the time since the last call, as `share.NAME`, and begins anew.
+
+        Nothing where no phase took any time, as by the clock of the serial mode.
+        """
+        now = self._clock()
         elapsed_s = max(now - self._since, 1e-9)
-        shares = {f"share.{name}": spent_s / elapsed_s for name, spent_s in self._spent_s.items()}
+        spent = self._spent_s.items() if any(self._spent_s.values()) else ()
+        shares = {f"share.{name}": spent_s / elapsed_s for name, spent_s in spent}
         self._spent_s = dict.fromkeys(self._spent_s, 0.0)
         self._since = now
         return shares
 
 
+class ReportLine(Protocol):
+    """What carries the reports of a role to the launcher."""
+
+    def send(self, report: Report) -> object:
+        """Sends a report, or drops it."""
+
+    def close(self) -> None:
+        """Ends the line."""
+
+
 class RoleReporter:
     """Gathers a role's figures and sends them about once a second. Sending never blocks."""
 
-    def __init__(self, assignment: Assignment, address: str = "") -> None:
-        """`address` is where the role listens, if it does."""
+    def __init__(
+        self,
+        assignment: Assignment,
+        address: str = "",
+        resources: Callable[[], Mapping[str, float]] = own_resources,
+        line: ReportLine | None = None,
+    ) -> None:
+        """Takes the role's part of the run, and what it reports beside its figures.
+
+        Args:
+            assignment: the role, its clock, and where it reports to.
+            address: where the role listens, if it does.
+            resources: measures what its process uses.
+            line: what carries the reports; None: ZeroMQ, to the address of the assignment.
+        """
         self._role = assignment.role.name
         self._pid, self._host, self._address = assignment.pid, assignment.host, address
-        self._reporter = Reporter(assignment.addresses.reports, keys=assignment.keys())
+        self._line = line or _reporter(assignment)
+        self._clock = assignment.clock
         self._totals: defaultdict[str, float] = defaultdict(float)
+        self._resources = resources
         self._gauges: dict[str, float] = {}
         self._sums: dict[str, tuple[float, int]] = {}
-        self._sent_s = time.monotonic()
+        self._sent_s = self._clock()
 
     @property
     def is_due(self) -> bool:
         """Whether the last report is a second old."""
-        return time.monotonic() - self._sent_s >= PERIOD_S
+        return self._clock() - self._sent_s >= PERIOD_S
 
     def count(self, name: str, more: float) -> None:
         """Adds to a counter that runs over the whole life of the role; its rate goes along as `NAME_per_s`."""
@@ -74,9 +108,9 @@ class RoleReporter:
 
     def send(self, state: str, phases: Phases | None = None) -> None:
         """Sends what was gathered and says what the role is doing or waiting for."""
-        now_s = time.monotonic()
+        now_s = self._clock()
         elapsed_s = max(now_s - self._sent_s, 1e-9)
-        metrics = dict(self._gauges)
+        metrics = {**self._gauges, **self._resources()}
         for name, total in self._totals.items():
             metrics[name] = total / elapsed_s if name.endswith("_per_s") else total
         for name in self._totals:
@@ -88,9 +122,27 @@ class RoleReporter:
         if phases is not None:
             metrics |= phases.shares()
         report = Report(self._role, self._pid, self._host, self._address, state, metrics)
-        self._reporter.send(report)
+        self._line.send(report)
         self._sent_s = now_s
 
+    def state(self) -> State:
+        """Returns what was gathered and not sent yet, the counters, and when the last report went."""
+        sums = {name: list(pair) for name, pair in self._sums.items()}
+        values = {"totals": dict(self._totals), "gauges": self._gauges, "sums": sums, "sent_s": self._sent_s}
+        return State(copy.deepcopy(values), {})
+
+    def restore(self, state: State) -> None:
+        """Continues from what `state` returned, by a clock that goes on from there."""
+        self._totals = defaultdict(float, state.values["totals"])
+        self._gauges = dict(state.values["gauges"])
+        self._sums = {name: (total, number) for name, (total, number) in state.values["sums"].items()}
+        self._sent_s = state.values["sent_s"]
+
     def close(self) -> None:
-        """Closes the socket."""
-        self._reporter.close()
+        """Closes the line."""
+        self._line.close()
+
+
+def _reporter(assignment: Assignment) -> Reporter:
+    addresses = assignment.addresses
+    return Reporter(addresses.reports, keys=assignment.keys(), generation=addresses.reports_generation)

@@ -7,6 +7,7 @@ one bat's flight depends on the others, to the bit.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from apex_bat.simulation.sensing import CONDITIONS, keep_onsets, silent_history,
 from apex_bat.simulation.sonar import Sonar
 from apex_bat.simulation.starts import start_region
 from apex_bat.simulation.world import World
+from apex_bat.storage import State
 
 Rows = NDArray[np.int64]
 
@@ -160,9 +162,59 @@ class Colony:
             "end": scoring.ENDS[self.end],
         }
 
+    def state(self) -> State:
+        """Returns all that the flights continue from: poses, counters, memories, and the bats' random generators.
+
+        World, sensors and ears add nothing: what they answer depends on the poses alone.
+        """
+        arrays = {name: array.copy() for name, array in self._arrays().items()}
+        return State({"generators": [generator.bit_generator.state for generator in self.generators]}, arrays)
+
+    def restore(self, state: State) -> None:
+        """Continues from what `state` returned: the next steps are those that would have followed, to the bit.
+
+        Raises:
+            ValueError: the state is of another number of bats, or of other rays or memory.
+        """
+        own = self._arrays()
+        wrong = sorted(
+            name
+            for name in own.keys() | state.arrays.keys()
+            if name not in own or name not in state.arrays or own[name].shape != state.arrays[name].shape
+        )
+        if wrong or len(state.values["generators"]) != len(self.generators):
+            raise ValueError(f"the state is of other bats: {', '.join(wrong) or 'generators'} does not fit")
+        for name, array in own.items():
+            array[...] = state.arrays[name]
+        for bat, numbers in enumerate(state.values["generators"]):
+            self.generators[bat] = np.random.default_rng()  # a new one: two colonies must not share theirs
+            self.generators[bat].bit_generator.state = numbers
+        self.world.place(np.arange(len(self.poses)), self.poses, self.arena_index)
+
     def close(self) -> None:
         """Closes the world."""
         self.world.close()
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """Returns the arrays of all bats themselves, by name."""
+        return {
+            "arena_index": self.arena_index,
+            "poses": self.poses,
+            "steps": self.steps,
+            "damage": self.damage,
+            "idle": self.idle,
+            "distance_m": self.distance_m,
+            "progress_m": self.progress_m,
+            "clearance_m": self.clearance_m,
+            "contact": self.contact,
+            "end": self.end,
+            "ranges_m": self.ranges_m,
+            "reward_straight": self.rewards.straight,
+            "reward_near": self.rewards.near,
+            "place_m": self._place_m,
+            "history": self._history,
+            "actions": self._actions,
+        }
 
     def _restart(self, rows: Rows, poses: NDArray[np.float64] | None) -> None:
         if len(self.arenas) > 1:

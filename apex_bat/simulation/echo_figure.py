@@ -18,6 +18,7 @@ from apex_bat.simulation.receiver import LISTENING_S
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 EARS = ("left ear", "right ear")
 COLOURS = ("#0072b2", "#d55e00")
@@ -26,17 +27,21 @@ POSE = (3.811, -0.6, 1.5)
 
 
 def draw_echo(echo: Echo, path: Path) -> None:
-    """Writes a PNG of the stages of one bat's echo in the rendering `thesis`; needs matplotlib.
+    """Writes a PNG of the stages of one bat's echo; arguments and errors are those of `echo_figure`."""
+    echo_figure(echo).savefig(path, format="png", dpi=80)
+
+
+def echo_figure(echo: Echo) -> Figure:
+    """Returns a drawing of the stages of one bat's echo in the rendering `thesis`; needs matplotlib.
 
     Args:
         echo: what one bat hears; its arrays have no axis of bats.
-        path: the file to write.
 
     Raises:
         ValueError: the echo is that of several bats, or of the rendering `exact`, which has no sound.
     """
     if echo.pressure_pa is None or echo.level_db.ndim != 2:
-        raise ValueError("draw_echo takes the echo of one bat, points of shape (points,), in the rendering thesis")
+        raise ValueError("echo_figure takes the echo of one bat, points of shape (points,), in the rendering thesis")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -63,14 +68,14 @@ def draw_echo(echo: Echo, path: Path) -> None:
     rows[-2, 0].set_ylabel("frame, 24 means", fontsize=8)
     rows[-1, 0].set_ylabel("cochleagram (kHz)", fontsize=8)
     FigureCanvasAgg(figure)
-    figure.savefig(path, format="png", dpi=80)
+    return figure
 
 
 def _draw_cochleagram(axes: Axes, levels: NDArray[np.float32], frequencies_hz: NDArray[np.float64]) -> None:
     times_ms = np.linspace(0.0, 1e3 * LISTENING_S, levels.shape[-1] + 1)
     middles_khz = np.sqrt(frequencies_hz[1:] * frequencies_hz[:-1]) / 1e3
     edges_khz = np.concatenate([frequencies_hz[:1] / 1e3, middles_khz, frequencies_hz[-1:] / 1e3])
-    axes.pcolormesh(times_ms, edges_khz, levels, cmap="magma")
+    axes.pcolormesh(times_ms, edges_khz, levels, cmap="magma", rasterized=True)
 
 
 def _echo_in_a_corridor() -> Echo:

@@ -17,6 +17,7 @@ from apex_bat.config.settings import Body, Episode, Rays, Sensing, Sonar
 from apex_bat.experience import ACTION_MEMORY, NUM_ACTIONS, NUM_BINS, NUM_EARS
 from apex_bat.simulation.arenas import Arena, load_arenas
 from apex_bat.simulation.colony import Colony
+from apex_bat.storage import State
 
 RENDER_MODES = ("rgb_array", "human")
 
@@ -149,6 +150,31 @@ class EchoFlightVector(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             return None
         pictures = {index: self.colony.world.picture(index) for index in set(self.colony.arena_index.tolist())}
         return tuple(pictures[index] for index in self.colony.arena_index.tolist())
+
+    def state(self) -> State:
+        """Returns all that the flights continue from, for `restore`; every bat must have been reset before.
+
+        Raises:
+            ValueError: there was no reset yet.
+        """
+        if not self._has_begun:
+            raise ValueError("call reset before state")
+        return self.colony.state()
+
+    def restore(self, state: State) -> Observation:
+        """Continues from what `state` of an environment with the same arguments returned; no reset is needed.
+
+        What follows is what would have followed there, to the bit: observations, contacts, drawn arenas, noise.
+
+        Returns:
+            the observation that the last reset or step returned.
+
+        Raises:
+            ValueError: the state does not fit.
+        """
+        self.colony.restore(state)
+        self._has_begun = True
+        return self.colony.observation()
 
     def close_extras(self, **_: Any) -> None:
         """Closes the world."""

@@ -1,13 +1,18 @@
 """The dueling network, and its twin in numpy."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
-from apex_bat.agent.inference import Policy, parameter_shapes
+from apex_bat.agent.d3qn import D3QN
+from apex_bat.agent.inference import Policy, parameter_shapes, part_norms
 from apex_bat.agent.network import DuelingNetwork, load_parameters, parameters_of
+from apex_bat.config import load
 from apex_bat.config.settings import Network
 from apex_bat.experience import States
+from apex_bat.roles.metrics import LEARNER_METRICS
 
 
 def random_states(batch: int, memory_steps: int = 3) -> States:
@@ -96,3 +101,17 @@ def test_weights_of_another_network_are_refused_by_name() -> None:
         Policy(Network(), 3).load(arrays)
     with pytest.raises(ValueError, match="another network"):
         load_parameters(DuelingNetwork(Network(), 3), arrays)
+
+
+def test_norms_are_those_of_whole_parts() -> None:
+    parameters = {"value.0.weight": np.full((3, 3), 2.0, np.float32), "value.0.bias": np.array([8.0], np.float32)}
+    assert part_norms({**parameters, "filters.0.bias": np.zeros(2, np.float32)}) == {
+        "weights_norm.value": 10.0,
+        "weights_norm.filters": 0.0,
+    }
+
+
+def test_every_part_of_the_network_is_declared() -> None:
+    norms = part_norms(D3QN(load(None), torch.device("cpu")).weights())
+    assert norms.keys() <= LEARNER_METRICS.keys()
+    assert all(math.isfinite(norm) and norm > 0.0 for norm in norms.values())

@@ -30,6 +30,10 @@ def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         (["train", "--set", "transport.keys=nowhere"], 1, "nowhere"),
         (["train", "--set", "replay.shards=2"], 2, "replay.shards is 2, and training starts one replay server"),
         (["train", "--nonsense"], 2, "No such option"),
+        (["train", "--resume", "nowhere"], 1, "nowhere: no run here"),
+        (["train", "--resume", "nowhere", "--run", "somewhere"], 2, "give one of them"),
+        (["train", "--without-replay"], 2, "belongs to --resume"),
+        (["train", "--serial", "--set", "device=cuda"], 2, "the serial mode promises equal bits"),
         (["evaluate", "nowhere"], 1, "nowhere: no run here"),
         (["inspect", "nowhere"], 1, "nowhere"),
         (["status", "nowhere"], 1, "no run was started here"),
@@ -136,3 +140,12 @@ def test_python_m_is_the_same_program(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "apex_bat", "--version"]
     output = subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ, cwd=tmp_path).stdout
     assert output.startswith("apex-bat ")
+
+
+def test_a_further_client_gets_a_folder_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert run(["keys", str(tmp_path / "keys")], monkeypatch, capsys)[0] == 0
+    assert run(["keys", str(tmp_path / "keys"), "--client", str(tmp_path / "b")], monkeypatch, capsys)[0] == 0
+    assert not (tmp_path / "b" / "server.secret").exists()
+    assert len((tmp_path / "keys" / "allowed_clients").read_text().split()) == 2

@@ -59,6 +59,7 @@ def test_none_takes_a_limit_away_and_survives_saving(tmp_path: Path) -> None:
         ("train.max_minutes=none", "training never ends"),
         ("network.channels=[4]", "give one each"),
         ("sonar.temperature_c=20.0", "do nothing unless absorption_db_m is None"),
+        ("recording.actors=[0,2]", "recording.actors names actor 2, and the 2 actors have the numbers 0 to 1"),
         ("seed", "expected section.key=value"),
         ("seed.x.y=3", "seed"),
         ("", "expected section.key=value"),

@@ -1,12 +1,14 @@
 """The live view fits its terminal."""
 
 import io
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from apex_bat.config import load
-from apex_bat.launching.live import TerminalView
+from apex_bat.launching.live import PlainView, TerminalView
 from apex_bat.launching.standing import Standing
 from apex_bat.launching.supervisor import Watched
 from apex_bat.roles.plan import roles_of
@@ -47,3 +49,32 @@ def test_view_fits_and_names_every_role(width: int, height: int, actors: int) ->
 def test_wide_terminal_shows_curves() -> None:
     assert any("▁" in line and "loss" in line for line in shown(160, 50, 2))
     assert not any("▁" in line for line in shown(80, 24, 2))
+
+
+@pytest.mark.parametrize("width", [80, 160])
+def test_a_standstill_is_shown_and_fits(width: int) -> None:
+    config = load(None, [])
+    standing = Standing(config, now_s=0.0)
+    standing.now_s = 75.0
+    watched = {role.name: Watched(role) for role in roles_of(config)}
+    standing.look(watched)
+    console = Console(width=width, height=24, force_terminal=True, file=io.StringIO(), color_system=None)
+    view = TerminalView(console, "apex-bat train")
+    view.show(standing, watched)
+    with console.capture() as capture:
+        console.print(view.renderable)
+    assert "standstill: no environment step and no update for 75 s" in capture.get()
+    assert max(map(len, capture.get().splitlines())) <= width
+
+    plain = io.StringIO()
+    PlainView(Console(file=plain)).show(standing, watched)
+    assert "learner: waiting to be started" in plain.getvalue()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_plain_lines_in_a_file_on_a_full_disk_do_not_end_the_run() -> None:
+    standing, is_through = Standing(load(None, []), now_s=0.0), False
+    with suppress(OSError), Path("/dev/full").open("w") as full:
+        PlainView(Console(file=full)).show(standing, {})
+        is_through = True
+    assert is_through

@@ -63,6 +63,7 @@ def test_mean_return_weighs_reports_by_their_episodes() -> None:
     standing = standing_of(Config())
     standing.take(report("actor-0", {"return": 1.0, "return_count": 1.0}), 1.0)
     standing.take(report("actor-1", {"return": 4.0, "return_count": 2.0}), 1.0)
+    standing.take(report("evaluator", {"return": 40.0}), 1.0)  # of longer flights
     assert standing.recent("return") == pytest.approx(3.0)
     assert standing.recent("return_greedy") is None
 

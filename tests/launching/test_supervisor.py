@@ -1,5 +1,6 @@
 """The restart policy, with time and processes driven by hand."""
 
+import errno
 from dataclasses import dataclass
 
 import pytest
@@ -32,7 +33,8 @@ class Puppet:
 class Stage:
     """A supervisor of one actor and the puppets that it started."""
 
-    def __init__(self, launch: Launch | None = None) -> None:
+    def __init__(self, launch: Launch | None = None, errors: list[OSError] | None = None) -> None:
+        self.errors = errors or []
         self.puppets: list[Puppet] = []
         self.incarnations: list[int] = []
         self.supervisor = Supervisor([ACTOR], self.start, launch or Launch())
@@ -40,6 +42,8 @@ class Stage:
 
     def start(self, role: Role, incarnation: int) -> Puppet:
         assert role == ACTOR
+        if self.errors:
+            raise self.errors.pop()
         self.incarnations.append(incarnation)
         self.puppets.append(Puppet(pid=100 + len(self.puppets)))
         return self.puppets[-1]
@@ -101,6 +105,7 @@ def test_a_silent_role_is_killed_and_replaced() -> None:
 
 def test_a_late_heartbeat_of_a_former_process_does_not_count() -> None:
     stage = Stage(Launch(heartbeat_timeout_s=10.0))
+    stage.supervisor.heard("actor-0", 100, 0.0)
     stage.supervisor.heard("actor-0", 99, 9.0)
     stage.supervisor.watch(10.5)
     assert stage.puppets[0].ended is not None
@@ -122,3 +127,72 @@ def test_a_stopped_role_is_asked_and_not_started_again() -> None:
     stage.supervisor.stop(["actor-0"])
     stage.supervisor.watch(100.0)
     assert len(stage.puppets) == 1
+
+
+def test_a_role_that_hangs_before_its_first_report_is_replaced_after_the_start_timeout() -> None:
+    stage = Stage(Launch(start_timeout_s=40.0, heartbeat_timeout_s=5.0))
+    stage.supervisor.watch(39.0)
+    assert stage.puppets[0].ended is None, "a start may take longer than a heartbeat"
+    stage.supervisor.watch(40.5)
+    stage.supervisor.watch(40.6)
+    stage.supervisor.watch(42.0)
+    assert stage.incarnations == [0, 1]
+    stage.supervisor.heard("actor-0", 101, 43.0)
+    stage.supervisor.watch(48.5)
+    assert stage.puppets[1].ended == Exit(-9, ""), "once it was heard, the heartbeat counts"
+
+
+def test_failures_of_a_role_that_worked_for_a_while_are_not_quick() -> None:
+    stage = Stage(Launch(quick_failure_s=10.0, max_failures=2))
+    now_s = 0.0
+    for _ in range(20):
+        now_s += 11.0
+        stage.fail(now_s)
+        now_s += 0.2
+        stage.supervisor.watch(now_s)
+    assert len(stage.puppets) == 21
+
+
+@pytest.mark.parametrize("when", ["at first", "again"])
+def test_a_machine_that_cannot_fork_for_a_while_costs_a_wait_and_not_the_run(when: str) -> None:
+    errors = [OSError(errno.EAGAIN, "Resource temporarily unavailable") for _ in range(20)]
+    stage = Stage(Launch(max_failures=2), errors if when == "at first" else [])
+    if when == "again":
+        stage.errors = errors
+        stage.fail(1.0)
+    watched = stage.supervisor.watched["actor-0"]
+    now_s = 0.0
+    while errors:
+        assert watched.due_s is not None
+        now_s = watched.due_s
+        stage.supervisor.watch(now_s)
+    assert watched.reason == "cannot be started: Resource temporarily unavailable"
+    assert watched.due_s is not None
+    assert watched.due_s - now_s == 30.0, "in the end it is tried every half minute"
+    stage.supervisor.watch(watched.due_s)
+    assert watched.handle is not None
+    assert watched.reason == ""
+
+
+def test_a_program_that_is_missing_ends_the_run_with_the_reason() -> None:
+    with pytest.raises(RoleFailedError, match="actor-0: cannot be started: No such file"):
+        Stage(errors=[OSError(errno.ENOENT, "No such file or directory")])
+
+
+def test_a_process_that_cannot_be_killed_is_not_killed_at_each_look() -> None:
+    stage = Stage(Launch(heartbeat_timeout_s=10.0))
+    stage.supervisor.heard("actor-0", 100, 0.0)
+    kills: list[float] = []
+    stage.puppets[0].kill = lambda: kills.append(1.0)  # type: ignore[method-assign]
+    for now_s in range(11, 20):
+        stage.supervisor.watch(float(now_s))
+    assert len(kills) == 1
+
+
+@pytest.mark.parametrize("code", [130, 143])
+def test_a_role_that_somebody_else_ended_starts_again(code: int) -> None:
+    stage = Stage()
+    stage.fail(1.0, code=code)
+    assert not stage.supervisor.is_done("actor-0")
+    stage.supervisor.watch(2.0)
+    assert len(stage.puppets) == 2

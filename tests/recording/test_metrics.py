@@ -1,6 +1,7 @@
 """The rows of a run: appended at once, and a full disk is an error, never a hang."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -34,13 +35,39 @@ def test_the_same_figures_are_tensorboard_events(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 @pytest.mark.parametrize("name", ["actor-0.jsonl", "tensorboard"])
-def test_a_full_disk_is_an_error_and_never_a_hang(name: str, tmp_path: Path) -> None:
+def test_a_full_disk_is_an_error_and_never_a_hang_and_rows_go_on_when_there_is_space(name: str, tmp_path: Path) -> None:
     with Path("/dev/full").open("wb", buffering=0) as full:
         writer = MetricsWriter(tmp_path)
         if name == "tensorboard":
-            writer._events._py_recordio_writer._writer = full
+            writer.append(REPORT, elapsed_s=1.5, env_steps=10, learner_step=3)
+            assert writer._events is not None
+            writer._events._py_recordio_writer._writer = full  # type: ignore[union-attr]
         else:
             (tmp_path / name).symlink_to("/dev/full")
         with pytest.raises(StorageError, match="No space left"):
             writer.append(REPORT, elapsed_s=1.5, env_steps=10, learner_step=3)
-        writer.close()
+    if name == "tensorboard":
+        writer.append(REPORT, elapsed_s=2.5, env_steps=11, learner_step=3)
+        files = sorted((tmp_path / "tensorboard").iterdir())
+        assert len(files) == 2, "what follows a torn event would not be read"
+        assert b"actor-0/return" in files[1].read_bytes()
+    writer.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of file sizes are POSIX")
+def test_a_row_that_finds_no_room_for_its_end_leaves_nothing(tmp_path: Path) -> None:
+    import resource
+
+    writer = MetricsWriter(tmp_path)
+    writer.append(REPORT, elapsed_s=1.5, env_steps=10, learner_step=3)
+    path = tmp_path / "actor-0.jsonl"
+    former = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 20, former[1]))
+    try:
+        with pytest.raises(StorageError):
+            writer.append(REPORT, elapsed_s=2.5, env_steps=11, learner_step=3)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, former)
+    writer.append(REPORT, elapsed_s=3.5, env_steps=12, learner_step=3)
+    writer.close()
+    assert [json.loads(line)["env_steps_total"] for line in path.read_text().splitlines()] == [10, 12]

@@ -58,3 +58,13 @@ def test_checkpoints_that_are_all_torn_are_never_a_silent_new_start(tmp_path: Pa
 def test_a_checkpoint_removed_while_it_was_judged_is_not_the_best(tmp_path: Path) -> None:
     assert not checkpoint.mark_best(tmp_path, tmp_path / "step-000000009.npz", (1.0, 1.0))
     assert not (tmp_path / checkpoint.BEST).exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk_costs_the_new_best_and_never_the_old_one(tmp_path: Path) -> None:
+    checkpoint.mark_best(tmp_path, save(tmp_path, 1), (1.0, 5.0))
+    (tmp_path / ".best.part").symlink_to("/dev/full")
+    with pytest.raises(StorageError, match="No space left"):
+        checkpoint.mark_best(tmp_path, save(tmp_path, 2), (1.0, 6.0))
+    assert checkpoint.load(tmp_path / checkpoint.BEST).learner_step == 1
+    assert checkpoint.mark_best(tmp_path, tmp_path / "step-000000002.npz", (1.0, 6.0)), "and there is space again"

@@ -188,7 +188,8 @@ def requested(config: Config, folder: Path) -> object:
         while rounds_left:  # some more after the first request, in which no further ones may come
             server.serve(0.1)
             rounds_left = min(rounds_left - 1, 5 if server.metrics()["replay.queued_requests"] else 100)
-        return server.metrics()["replay.queued_requests"], [r.message.batch_size for r in server._requests][:1]
+        waiting = server._requests.peek()
+        return server.metrics()["replay.queued_requests"], waiting and waiting.batch_size
     finally:
         whole.stop.set()
         thread.join(20)

@@ -1,0 +1,101 @@
+"""An actor that was started late or restored goes on where the run stands."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apex_bat.agent.exploration import annealed, choose_actions
+from apex_bat.config import Config, load
+from apex_bat.replay.store import ReplayStore
+from apex_bat.roles import actor as actor_module
+from apex_bat.roles.actor import Actor
+from apex_bat.roles.learner import new_agent
+from apex_bat.roles.plan import Addresses, Assignment, Role
+from apex_bat.roles.reporting import RoleReporter
+from apex_bat.roles.serial import BoardReader, StoreSink, WeightsBoard
+from apex_bat.storage import State, read_arrays, write_arrays
+from apex_bat.transport.messages import Report
+
+SMALL = ("network.channels=[4]", "network.strides=[3]", "network.hidden=[8]", "bats_per_actor=3", "actors=2",
+         "actor.chunk_transitions=10", "sonar.rendering=exact", "episode.training_steps=17", "rays.num_azimuth=12",
+         "rays.num_elevation=2", "replay.min_size=500", "replay.capacity=500", "recording.every_episodes=0",
+         "body.heading_noise_deg=2.0")  # fmt: skip
+
+
+class Dropped:
+    """Reports that nobody reads."""
+
+    def send(self, report: Report) -> None:
+        assert report.role == "actor-0"
+
+    def close(self) -> None:
+        return None
+
+
+class Flying:
+    """An actor and the replay that it fills."""
+
+    def __init__(self, config: Config, stack: ExitStack, flown_steps: int = 0) -> None:
+        assignment = Assignment(
+            Role("actor", 0), config, Path(), Addresses("", "", ""), threading.Event(), 0, flown_steps, lambda: 0.0
+        )
+        self.store = ReplayStore(config, np.random.default_rng(0))
+        board = WeightsBoard()
+        board.publish(1, 0, new_agent(assignment).weights())
+        reporter = RoleReporter(assignment, resources=dict, line=Dropped())
+        made = Actor(assignment, StoreSink(self.store, "actor-0"), BoardReader(board), reporter)
+        self.actor = stack.enter_context(closing(made))
+
+    def fly(self, steps: int) -> None:
+        for _ in range(steps):
+            assert self.actor.is_ready(0.0)
+            self.actor.step()
+
+
+def epsilons_of(flown_steps: int, steps: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The epsilons with which an actor chose its actions."""
+    used: list[float] = []
+
+    def noting(q: np.ndarray, epsilons: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+        used.append(float(epsilons[0]))
+        return choose_actions(q, epsilons, generator)
+
+    monkeypatch.setattr(actor_module, "choose_actions", noting)
+    config = load(None, [*SMALL, "exploration.kind=anneal", "exploration.anneal_steps=1000"])
+    with ExitStack() as stack:
+        Flying(config, stack, flown_steps).fly(steps)
+    return used
+
+
+def test_annealing_goes_on_where_the_run_stood_when_the_actor_was_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    exploration = load(None, ["exploration.kind=anneal", "exploration.anneal_steps=1000"]).exploration
+    assert epsilons_of(0, 3, monkeypatch) == [annealed(steps, exploration) for steps in (0, 6, 12)]
+    assert epsilons_of(600, 3, monkeypatch) == [annealed(steps, exploration) for steps in (600, 606, 612)]
+
+
+def test_a_restored_actor_makes_the_experience_that_it_would_have_made(tmp_path: Path) -> None:
+    config = load(None, list(SMALL))
+    with ExitStack() as stack:
+        one, other = Flying(config, stack), Flying(config, stack)
+        one.fly(43)
+        before = one.store.buffer.counters
+        state = one.actor.state()
+        write_arrays(tmp_path / "state.npz", "state", {"values": state.values}, state.arrays)
+        header, arrays = read_arrays(tmp_path / "state.npz", "state")
+        other.actor.restore(State(header["values"], arrays))
+        one.fly(40)
+        other.fly(40)
+        rows, items = one.store.buffer.counters.next_row, one.store.buffer.counters.next_item
+        assert items - before.next_item == other.store.buffer.counters.next_item > 60
+        new = {name: values[before.next_row : rows] for name, values in one.store.buffer.row_arrays().items()}
+        for name, values in other.store.buffer.row_arrays().items():
+            np.testing.assert_array_equal(values[: rows - before.next_row], new[name], err_msg=name)
+        for name in ("reward", "discount", "priority", "span"):
+            expected = one.store.buffer.item_arrays()["items"][name][before.next_item : items]
+            got = other.store.buffer.item_arrays()["items"][name][: items - before.next_item]
+            np.testing.assert_array_equal(got, expected, err_msg=name)

@@ -1,0 +1,165 @@
+"""A role's process: held by its leash whatever it does, ended by others it says so, and its log keeps crashes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from apex_bat.config import load
+from apex_bat.config.loading import dumps
+from apex_bat.launching.processes import RoleProcess, remove_unfinished
+from apex_bat.roles.plan import Role
+from apex_bat.roles.resources import began_unix_s, is_same_process
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals and sessions are POSIX")
+
+CHILD = """
+import os, signal, sys, threading, time
+from apex_bat.roles.process import hold_leash
+stop = threading.Event()
+hold_leash(stop, 0.5)
+print(os.getpid(), flush=True)
+{body}
+"""
+BODIES = {
+    "waits politely": "stop.wait()",
+    "is busy in Python": "while True: pass",
+    "sleeps": "time.sleep(1000)",
+    "is blocked in C": "os.read(os.pipe()[0], 1)",
+    "swallows every exception": "while True:\n try: stop.wait(); time.sleep(1000)\n except BaseException: pass",
+    "is stopped": "os.kill(os.getpid(), signal.SIGSTOP); time.sleep(1000)",
+}
+LAUNCHER = """
+import subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-c", sys.argv[1]], stdin=subprocess.PIPE, start_new_session=True)
+time.sleep(1000)
+"""
+
+
+def eventually(condition: Callable[[], object], within_s: float, what: str) -> None:
+    deadline_s = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < deadline_s, f"not within {within_s} s: {what}"
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_a_role_whose_launcher_is_killed_ends_whatever_it_does(body: str) -> None:
+    if body == "is stopped" and sys.platform != "linux":
+        pytest.skip("only Linux continues a stopped orphan")
+    child = CHILD.format(body=BODIES[body])
+    launcher = subprocess.Popen([sys.executable, "-c", LAUNCHER, child], stdout=subprocess.PIPE, text=True)
+    assert launcher.stdout is not None
+    pid = int(launcher.stdout.readline())
+    try:
+        if body == "is stopped":
+            eventually(lambda: _is_stopped(pid), 10.0, "it is stopped")
+        launcher.kill()
+        launcher.wait()
+        eventually(lambda: began_unix_s(pid) is None, 10.0, "the role is gone")
+    finally:
+        launcher.stdout.close()
+        if began_unix_s(pid) is not None:
+            os.kill(pid, signal.SIGKILL)
+
+
+def _is_stopped(pid: int) -> bool:
+    import psutil
+
+    return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run folder with all that a replay server needs to start."""
+    for name in ("logs", "replay", "checkpoints"):
+        (tmp_path / name).mkdir()
+    folder = tmp_path / "sockets"
+    folder.mkdir(mode=0o700)
+    config = load(None, ["replay.min_size=16", "replay.capacity=100", "launch.log_max_mb=0.002", "launch.log_files=2"])
+    (tmp_path / "config.toml").write_text(dumps(config))
+    addresses = {name: f"ipc://{folder / name}" for name in ("replay", "weights", "reports")}
+    (tmp_path / "addresses.json").write_text(json.dumps(addresses))
+    return tmp_path
+
+
+def ended(process: RoleProcess, within_s: float = 30.0) -> int | None:
+    eventually(lambda: process.poll() is not None, within_s, "it ends")
+    result = process.poll()
+    assert result is not None
+    return result.code
+
+
+def serves(run: Path) -> bool:
+    return (run / "sockets" / "replay").exists()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_role_that_somebody_else_ends_says_so(run: Path, number: signal.Signals, code: int) -> None:
+    process = RoleProcess(Role("replay", 0), run, 0, 1)
+    try:
+        eventually(lambda: serves(run), 30.0, "it serves")
+        os.kill(process.pid, number)
+        assert ended(process) == code
+    finally:
+        process.kill()
+
+
+def test_a_role_that_its_launcher_lets_go_of_ends_with_a_last_snapshot(run: Path) -> None:
+    process = RoleProcess(Role("replay", 0), run, 0, 1)
+    try:
+        eventually(lambda: serves(run), 30.0, "it serves")
+        process.stop()
+        assert ended(process) == 0
+        assert (run / "replay" / "replay.snapshot").exists()
+    finally:
+        process.kill()
+
+
+def test_a_crash_in_c_code_is_in_the_log_and_a_log_too_long_is_renamed_first(run: Path) -> None:
+    log = run / "logs" / "replay.log"
+    log.write_text("line of a former process\n" * 200)
+    process = RoleProcess(Role("replay", 0), run, 0, 1)
+    try:
+        eventually(lambda: serves(run), 30.0, "it serves")
+        os.kill(process.pid, signal.SIGSEGV)
+        assert ended(process) == -signal.SIGSEGV
+    finally:
+        process.kill()
+    assert "former process" in log.with_name("replay.log.1").read_text()
+    assert "former process" not in log.read_text()
+    assert "Segmentation fault" in log.read_text(), "what faulthandler writes follows the log"
+
+
+def test_settings_that_a_role_cannot_use_are_the_line_that_a_person_reads(run: Path) -> None:
+    (run / "config.toml").write_text("nonsense = 1\n")
+    process = RoleProcess(Role("replay", 0), run, 0, 1)
+    assert ended(process) == 2
+    result = process.poll()
+    assert result is not None
+    assert "nonsense: no such setting" in result.detail
+
+
+def test_what_a_killed_process_was_writing_is_removed_and_nothing_else(run: Path) -> None:
+    parts = [run / "checkpoints" / f".step-000000001.npz.{pid}.part" for pid in (11, 12)]
+    others = [run / "checkpoints" / "step-000000001.npz", run / "replay" / "replay.snapshot.writing"]
+    for path in (*parts, *others):
+        path.touch()
+    remove_unfinished(run, Role("learner", 0), 11)
+    assert not parts[0].exists()
+    assert all(path.exists() for path in (parts[1], *others))
+    remove_unfinished(run, Role("replay", 0), 13)
+    assert not others[1].exists()
+
+
+def test_another_process_with_the_same_number_is_not_taken_for_the_one_noted() -> None:
+    began = began_unix_s(os.getpid())
+    assert began is not None
+    assert is_same_process(os.getpid(), began)
+    assert not is_same_process(os.getpid(), began - 60.0)

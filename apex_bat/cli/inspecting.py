@@ -72,8 +72,8 @@ def inspect(
         raise typer.BadParameter("one run, or two to see side by side", param_hint="RUNS")
     outputs = {"png": png, "gif": gif, "mp4": mp4, "csv": csv, "parquet": parquet}
     wanted = {kind: path for kind, path in outputs.items() if path is not None}
-    if len(runs) == 2 and (wanted or show_list or live):
-        raise typer.BadParameter("two runs can only be opened in the viewer", param_hint="RUNS")
+    if len(runs) == 2 and (wanted or show_list or live or view is ViewName.training):
+        raise typer.BadParameter("of two runs only flights can be seen, in the viewer", param_hint="RUNS")
     if live:
         from apex_bat.recording.streaming import stream_run
 
@@ -87,7 +87,7 @@ def inspect(
         raise typer.Exit(_open_training(runs[0], show))
     entries = list_flights(runs[0], condition)
     if len(runs) == 2:
-        raise typer.Exit(_open_pair(runs, choose_flight(entries, flight or "best"), condition, show))
+        raise typer.Exit(_open_pair(runs, choose_flight(entries, flight or "best"), condition, view, show))
     if wanted:
         _export(choose_flight(entries, flight or "best"), wanted)
     elif show_list:
@@ -132,7 +132,7 @@ def _open_training(run: Path, show: Show) -> int:
 
 def _open(run: Path, entries: Sequence[Entry], view: ViewName, show: Show, *, with_training: bool) -> int:
     """Opens recordings; the first entry is shown first."""
-    from apex_bat.recording.blueprints import APPLICATION_ID, BLUEPRINTS
+    from apex_bat.recording.blueprints import APPLICATION_ID, BLUEPRINTS, list_recordings
     from apex_bat.recording.keeping import TRAINING_RECORDING
     from apex_bat.recording.reading import read_settings
     from apex_bat.recording.viewing import save_layout
@@ -142,10 +142,11 @@ def _open(run: Path, entries: Sequence[Entry], view: ViewName, show: Show, *, wi
     paths += [entry.path for entry in reversed(entries)]
     with tempfile.TemporaryDirectory() as folder:
         layout = BLUEPRINTS[view.value](read_settings(entries[0].path).arena)
+        layout = list_recordings(layout) if len(paths) > 1 else layout
         return show(paths, save_layout(layout, APPLICATION_ID, Path(folder)), Path(folder))
 
 
-def _open_pair(runs: Sequence[Path], entry: Entry, condition: str, show: Show) -> int:
+def _open_pair(runs: Sequence[Path], entry: Entry, condition: str, view: ViewName, show: Show) -> int:
     """Opens a flight of the first run beside the one of the second that began at the same pose."""
     from apex_bat.recording.blueprints import pair_blueprint
     from apex_bat.recording.catalog import list_flights, same_start
@@ -157,7 +158,7 @@ def _open_pair(runs: Sequence[Path], entry: Entry, condition: str, show: Show) -
     with tempfile.TemporaryDirectory() as folder:
         pair = Path(folder, "pair.rrd")
         write_pair(entry.path, other.path, pair)
-        layout = pair_blueprint(read_settings(entry.path).arena, (names[0], names[1]))
+        layout = pair_blueprint(read_settings(entry.path).arena, (names[0], names[1]), view.value)
         return show([pair], save_layout(layout, PAIR_APPLICATION_ID, Path(folder)), Path(folder))
 
 

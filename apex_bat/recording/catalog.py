@@ -72,7 +72,8 @@ def choose_flight(entries: Sequence[Entry], which: str) -> Entry:
 
     Args:
         entries: at least one.
-        which: `best`, `worst`, `crash`, or a number, from 0 in the order of the entries.
+        which: `best`, `worst`, `crash` (the one that flew longest before it), or a number, from 0 in the order of the
+            entries.
 
     Raises:
         RecordingError: there is no such flight.
@@ -87,10 +88,11 @@ def choose_flight(entries: Sequence[Entry], which: str) -> Entry:
     if which == "worst":
         return min(judged, key=lambda entry: entry.merit)
     if which == "crash":
-        crashes = [entry for entry in (*judged, *entries) if entry.end in ("contact", "damage")]
-        if not crashes:
-            raise RecordingError("no recorded flight ended at a wall")
-        return crashes[0]
+        for group in (judged, entries):
+            crashes = [entry for entry in group if entry.end in ("contact", "damage")]
+            if crashes:
+                return max(crashes, key=lambda entry: entry.steps)
+        raise RecordingError("no recorded flight ended at a wall")
     raise RecordingError(f"flight {which!r}: best, worst, crash or a number of the list")
 
 

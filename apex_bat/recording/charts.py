@@ -20,40 +20,51 @@ Tick = tuple[str, float]
 
 
 def log_image_style(
-    recording: rr.RecordingStream, path: str, size: tuple[int, int], dtype: Literal["F16", "F32"], y_ticks: list[Tick]
+    recording: rr.RecordingStream,
+    path: str,
+    size: tuple[int, int],
+    dtype: Literal["F16", "F32"],
+    y_ticks: list[Tick],
+    *,
+    x_ticks: list[Tick] | None = None,
+    value_range: tuple[float, float] = COCHLEA_RANGE,
 ) -> None:
-    """Logs once how the images of an entity are drawn, with milliseconds of echo below and ticks to the left.
+    """Logs once how the images of an entity are drawn, with ticks below and to the left.
 
     Args:
         recording: where to.
         path: entity path of the image; the labels go to `axes` below it.
-        size: width and height in pixels; the width spans the 24 ms of an echo.
+        size: width and height in pixels.
         dtype: of the pixels.
         y_ticks: along the left edge.
+        x_ticks: along the lower edge; None: the 24 ms of an echo, which the width spans.
+        value_range: what the colours span.
     """
     width, height = size
     image = rr.DepthImage.from_fields(
         format=rr.components.ImageFormat(width=width, height=height, channel_datatype=dtype),
         meter=1.0,
         colormap="viridis",
-        depth_range=COCHLEA_RANGE,
+        depth_range=value_range,
         magnification_filter="nearest",
     )
     recording.log(path, image, static=True)
-    below = [(ms * width / NUM_BINS, 1.02 * height) for ms in TICKS_MS]
+    if x_ticks is None:
+        x_ticks = [(f"{ms} ms", ms * width / NUM_BINS) for ms in TICKS_MS]
+    below = [(place, 1.02 * height) for _, place in x_ticks]
     beside = [(-0.07 * width, place - 0.06 * height) for _, place in y_ticks]
-    labels = [*(f"{ms} ms" for ms in TICKS_MS), *(text for text, _ in y_ticks)]
+    labels = [text for text, _ in (*x_ticks, *y_ticks)]
     points = rr.Points2D(below + beside, labels=labels, radii=[0.0], colors=[LABEL_COLOUR], show_labels=True)
     recording.log(f"{path}/axes", points, static=True)
 
 
 def log_bars_style(
-    recording: rr.RecordingStream, path: str, colour: Rgb, at_ms: NDArray[np.float64], width_ms: float
+    recording: rr.RecordingStream, path: str, colour: Rgb, places: NDArray[np.float64], width: float
 ) -> None:
-    """Logs once the colour of bars, where they stand in ms, and how wide each is."""
-    abscissa = at_ms.astype(np.float32)
+    """Logs once the colour of bars, where they stand (mostly in ms), and how wide each is."""
+    abscissa = places.astype(np.float32)
     chart = rr.BarChart(
-        np.zeros_like(abscissa), color=colour, abscissa=abscissa, widths=np.full_like(abscissa, width_ms)
+        np.zeros_like(abscissa), color=colour, abscissa=abscissa, widths=np.full_like(abscissa, width)
     )  # it takes abscissa and widths only together with values
     style = [batch for batch in chart.as_component_batches() if "values" not in str(batch.component_descriptor())]
     recording.log(path, style, static=True)

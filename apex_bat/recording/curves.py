@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,16 +16,26 @@ import rerun as rr
 
 from apex_bat.agent.exploration import annealed, ladder
 from apex_bat.config import Config
-from apex_bat.recording.columns import tensor_columns
+from apex_bat.recording.priorities import (
+    PriorityImage,
+    PriorityMap,
+    log_priorities_style,
+    send_histograms,
+    send_images,
+)
 from apex_bat.recording.series import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Rgb
+from apex_bat.replay.metrics import PRIORITY_BINS
 
 TRAINING_APPLICATION_ID = "apex_bat_training"
 PALETTE: tuple[Rgb, ...] = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY)
 MEAN_S = 15.0
 """Seconds of returns that are averaged: a row holds those of a few episodes only, which is mostly noise."""
+IMAGE_PERIOD_S = 10.0
+"""Seconds between images of the priorities over time, each of 4 KB."""
 HISTOGRAM_PREFIX = "replay.priority_hist."
-"""Metrics of the replay that start so are the counts of a histogram, ordered by the number after it."""
-HISTOGRAM_PATH = "replay/priorities"
+"""Metrics of the replay that start so are the shares of a histogram's bins, ordered by the number after it."""
+HISTOGRAM_NAME = "priorities"
+"""Entity of the histogram below the role's name."""
 EPSILON_PATH = "exploration/epsilon"
 LADDER_PATH = "exploration/ladder"
 EVENTS_PATH = "events"
@@ -79,7 +89,6 @@ CURVES: dict[str, tuple[Curve, ...]] = {
         Curve("completed_share", ("completed_share",)),
         Curve("progress_m", ("progress_m",)),
         Curve("return", ("return",)),
-        Curve("weights_norm", ("weights_norm.filters", "weights_norm.value", "weights_norm.advantage")),
     ),
 }
 """The entities of each kind of role."""
@@ -102,6 +111,9 @@ class TrainingCurves:
         self._known: dict[str, Mapping[str, Any]] = {}
         self._means: dict[tuple[str, str], _Mean] = {}
         self._styled: set[str] = set()
+        self._maps: dict[str, PriorityMap] = {}
+        self._drawn: defaultdict[str, list[tuple[_Moment, PriorityImage]]] = defaultdict(list)
+        self._drawn_s: dict[str, float] = {}
         recording.send_recording_name(name)
         if config.exploration.kind == "ladder":
             epsilons = ladder(config.actors * config.bats_per_actor, config.exploration)
@@ -117,18 +129,12 @@ class TrainingCurves:
             if not all(map(math.isnan, values)):
                 self._gather(f"{role}/{curve.name}", moment, values, curve.metrics)
         histogram = sorted((name for name in row if name.startswith(HISTOGRAM_PREFIX)), key=_histogram_place)
-        if histogram:
-            self._gather(HISTOGRAM_PATH, moment, [float(row[name]) for name in histogram], ())
+        if len(histogram) == PRIORITY_BINS:
+            self._take_priorities(f"{role}/{HISTOGRAM_NAME}", moment, [float(row[name]) for name in histogram])
         if self._config.exploration.kind == "anneal" and role == "learner":
             epsilon = annealed(moment.env_steps, self._config.exploration)
             self._gather(EPSILON_PATH, moment, [epsilon], ("epsilon",))
-        if before is None or before["pid"] != row["pid"]:
-            self._events.append(
-                (moment, f"{role}: process {row['pid']} {'started' if before is None else 'took over'}")
-            )
-        if str(row["state"]).startswith("judged"):
-            share, way_m = row.get("completed_share", math.nan), row.get("progress_m", math.nan)
-            self._events.append((moment, f"{row['state']}: {share:.0%} complete, {way_m:.0f} m"))
+        self._events += [(moment, f"{_clock(moment.elapsed_s)} {text}") for text in _events(row, before)]
         self._known[role] = row
 
     def flush(self) -> None:
@@ -136,11 +142,14 @@ class TrainingCurves:
         for path, rows in self._rows.items():
             values = np.array([row.values for row in rows])
             times = _times([row.moment for row in rows])
-            if path == HISTOGRAM_PATH:
-                self._recording.send_columns(path, times, tensor_columns("BarChart", values.astype(np.float32)))
+            if path in self._maps:
+                send_histograms(self._recording, path, values, times)
             else:
                 columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition([values.shape[1]] * len(values))
                 self._recording.send_columns(path, times, columns)
+        for path, drawn in self._drawn.items():
+            moments, images = zip(*drawn, strict=True)
+            send_images(self._recording, path, images, _times(list(moments)))
         if self._events:
             times = _times([moment for moment, _ in self._events])
             self._recording.send_columns(
@@ -148,6 +157,16 @@ class TrainingCurves:
             )
         self._events.clear()
         self._rows.clear()
+        self._drawn.clear()
+
+    def _take_priorities(self, path: str, moment: _Moment, shares: list[float]) -> None:
+        """Takes a histogram; now and then the image of all so far is drawn."""
+        over_time = self._maps.setdefault(path, PriorityMap())
+        over_time.take(shares, moment.elapsed_s)
+        self._gather(path, moment, shares, ())
+        if moment.elapsed_s >= self._drawn_s.get(path, -math.inf) + IMAGE_PERIOD_S:
+            self._drawn_s[path] = moment.elapsed_s
+            self._drawn[path].append((moment, over_time.draw()))
 
     def _gather(self, path: str, moment: _Moment, values: list[float], names: tuple[str, ...]) -> None:
         if path not in self._styled:
@@ -167,7 +186,8 @@ class TrainingCurves:
 
     def _log_style(self, path: str, names: tuple[str, ...]) -> None:
         """Logs once the names and colours of an entity's lines; the first actors have colours of their own."""
-        if path == HISTOGRAM_PATH:
+        if path in self._maps:
+            log_priorities_style(self._recording, path)
             return
         role = path.partition("/")[0]
         _, _, number = role.partition("-")
@@ -194,6 +214,19 @@ class _Mean:
         mean = self._total / self._weight
         self._since_s, self._total, self._weight = now_s, 0.0, 0.0
         return mean
+
+
+def _events(row: Mapping[str, Any], before: Mapping[str, Any] | None) -> Iterator[str]:
+    """What a row tells beside its figures: a new process, a checkpoint judged."""
+    if before is None or before["pid"] != row["pid"]:
+        yield f"{row['role']}: process {row['pid']} {'started' if before is None else 'took over'}"
+    if str(row["state"]).startswith("judged"):
+        share, way_m = row.get("completed_share", math.nan), row.get("progress_m", math.nan)
+        yield f"update {row.get('learner_step', math.nan):.0f}: {100 * share:.0f} % complete, {way_m:.0f} m"
+
+
+def _clock(elapsed_s: float) -> str:
+    return f"{int(elapsed_s // 60)}:{int(elapsed_s % 60):02}"
 
 
 def _growth_per_s(name: str, row: Mapping[str, Any], before: Mapping[str, Any] | None) -> float:

@@ -176,7 +176,15 @@ def _send_properties(recording: rr.RecordingStream, flight: Flight) -> None:
     }
     values: dict[str, Any] = {name: value for name, value in known.items() if value is not None}
     recording.send_property("flight", rr.AnyValues(**values))
-    recording.send_recording_name(facts.file_name().removesuffix(".rrd"))
+    recording.send_recording_name(_name(flight))
+
+
+def _name(flight: Flight) -> str:
+    """What the viewer lists the recording as; the list is narrow, so that what tells flights apart comes first."""
+    facts = flight.facts
+    number = f"{facts.episode}" if facts.kind == "evaluation" else f"training {facts.episode}"
+    weights = "" if facts.checkpoint_step is None else f", update {facts.checkpoint_step}"
+    return f"{number} {facts.mark or flight.end or 'broken off'}, {facts.arena}, {facts.condition}{weights}"
 
 
 def _send_events(recording: rr.RecordingStream, flight: Flight) -> None:
@@ -191,5 +199,6 @@ def _send_events(recording: rr.RecordingStream, flight: Flight) -> None:
     events += [(flight.num_steps, "INFO", f"end: {flight.end or 'broken off'}")]
     events.sort(key=lambda event: event[0])
     steps, levels, texts = zip(*events, strict=True)
-    columns = rr.TextLog.columns(text=texts, level=levels)
+    named = [f"step {step}: {text}" for step, text in zip(steps, texts, strict=True)]
+    columns = rr.TextLog.columns(text=named, level=levels)
     recording.send_columns("events", _times(flight, np.array(steps)), columns)

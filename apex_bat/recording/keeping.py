@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
+from typing import get_args
 
 from apex_bat.config import Config
 from apex_bat.config.settings import Recording
@@ -49,6 +50,7 @@ def choose(flights: Sequence[Flight], settings: Recording, num_first: int) -> li
         order = sorted(range(len(flights)), key=lambda i: merit(flights[i]))
         marks |= {order[0]: "worst", order[-1]: "best"}
     crashes = [i for i, flight in enumerate(flights) if flight.contact.any() and not marks.get(i)]
+    crashes.sort(key=lambda i: -flights[i].num_steps)  # a start that faces a wall tells less
     marks |= dict.fromkeys(crashes[: settings.crashes], "crash")
     return [replace(flights[i], facts=replace(flights[i].facts, mark=marks[i])) for i in sorted(marks)]
 
@@ -78,6 +80,8 @@ def keep_flights(
         chosen = of_arena if num_first is None else choose(of_arena, config.recording, num_first)
         for number, flight in enumerate(chosen):
             paths.append(folder / flight.facts.file_name())
+            for mark in get_args(Mark):  # the same flight may have got another mark among other flights before
+                (folder / replace(flight.facts, mark=mark).file_name()).unlink(missing_ok=True)
             write_flight(flight, arena, config.sonar, directions, paths[-1])
             if draw and number == 0:
                 draw_flight(flight, arena, run / "figures" / f"{paths[-1].stem}.png")

@@ -35,7 +35,7 @@ class MapPanel:
 
     def __init__(self, axes: Axes, flight: Flight, arena: Arena) -> None:
         self._flight = flight
-        _draw_arena(axes, arena)
+        draw_walls(axes, arena)
         self._draw_trail(axes)
         self._draw_marks(axes)
         extent = arena_extent_m(arena)
@@ -145,7 +145,8 @@ def _label(axes: Axes, text: str, place: tuple[float, float], offset_points: tup
     return label
 
 
-def _draw_arena(axes: Axes, arena: Arena) -> None:
+def draw_walls(axes: Axes, arena: Arena) -> None:
+    """Draws walls, pillars and models of an arena, seen from above."""
     from matplotlib.collections import PolyCollection
     from matplotlib.patches import Circle
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import shutil
-import socket
 import subprocess
 import tempfile
 import time
@@ -21,10 +20,12 @@ import numpy as np
 import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient
 
+from apex_bat.recording.viewing import HOST, free_port
+
 SIZE = (1600, 900)
 TIMEOUT_S = 120.0
 _POLL_S = 0.3
-_SETTLE_S = 4.0  # chunks are fetched on demand, and views find their ranges over some images
+_SETTLE_S = 6.0  # chunks are fetched on demand, views find their ranges over some images, a greeting fades
 _Answer = TypeVar("_Answer")
 
 
@@ -41,7 +42,7 @@ def take_screenshot(paths: Sequence[Path], picture: Path, at: float | None = Non
         at: where on the timeline of the layout: a step, or a time in s; None: where the viewer begins.
 
     Raises:
-        ScreenshotError: the viewer does not start here, or shows no recording.
+        ScreenshotError: the viewer does not start here, shows no recording, or one that is shorter than `at`.
     """
     deadline_s = time.monotonic() + TIMEOUT_S
     with _viewer(paths) as (process, url, log):
@@ -51,6 +52,8 @@ def take_screenshot(paths: Sequence[Path], picture: Path, at: float | None = Non
             while True:
                 try:
                     answer = ask()
+                except ScreenshotError:
+                    raise
                 except (ConnectionError, RuntimeError, TimeoutError) as error:
                     answer, reason = None, str(error)
                 else:
@@ -74,19 +77,17 @@ def take_screenshot(paths: Sequence[Path], picture: Path, at: float | None = Non
 @contextmanager
 def _viewer(paths: Sequence[Path]) -> Iterator[tuple[subprocess.Popen[bytes], str, Path]]:
     """A viewer without a window on this machine's own address; ended with the block."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     program = shutil.which("rerun", path=str(Path(rerun_cli.__file__).parent)) or "rerun"
     size = "x".join(map(str, SIZE))
-    command = [program, *map(str, paths), "--headless", "--bind", "127.0.0.1", "--port", str(port),
+    command = [program, *map(str, paths), "--headless", "--bind", HOST, "--port", str(port),
                "--window-size", size, "--hide-welcome-screen"]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder, "viewer.log")
         with log.open("wb") as out:
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out)  # noqa: S603  # our own
             try:
-                yield process, f"rerun+http://127.0.0.1:{port}/proxy", log
+                yield process, f"rerun+http://{HOST}:{port}/proxy", log
             finally:
                 process.kill()
                 process.wait()
@@ -110,6 +111,9 @@ def _go_to(client: ViewerClient, at: float) -> bool:
     state = client.get_state()
     shown = next(each for each in state.recordings if each.store_id == state.active_recording)
     timeline = next(each for each in shown.timelines if each.name == shown.current_timeline)
+    per_unit = 1.0 if timeline.time_type == "sequence" else 1e9
+    if timeline.end is not None and at * per_unit > timeline.end:
+        raise ScreenshotError(f"there is no {timeline.name} {at:g}; the last is {timeline.end / per_unit:g}")
     if timeline.time_type == "sequence":
         client.set_time(timeline.name, play_state="paused", sequence=round(at))
     else:

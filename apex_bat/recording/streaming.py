@@ -7,7 +7,6 @@ everything from the start.
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import socket
@@ -28,6 +27,8 @@ from apex_bat import config as configuration
 from apex_bat.recording.blueprints import APPLICATION_ID, flight_blueprint, training_blueprint
 from apex_bat.recording.curves import TRAINING_APPLICATION_ID, TrainingCurves
 from apex_bat.recording.reading import RecordingError, is_whole, read_settings
+from apex_bat.recording.training import row_of
+from apex_bat.storage import StorageError, read_json
 
 HOST = "127.0.0.1"
 PORT = 9876
@@ -143,7 +144,9 @@ class RunStream:
                     if not line.endswith(b"\n"):  # still being written
                         break
                     self._offsets[path] = self._offsets.get(path, 0) + len(line)
-                    yield json.loads(line)
+                    row = row_of(line)
+                    if row is not None:
+                        yield row
 
     def _send_flight(self) -> None:
         """Sends the newest evaluation flight, if it is a new one."""
@@ -191,8 +194,8 @@ def _is_listening(port: int) -> bool:
 def _is_running(run: Path) -> bool:
     """Whether the run's launcher has not yet noted how it ended."""
     try:
-        return bool(json.loads((run / "run.json").read_text(encoding="utf-8"))["outcome"] == "running")
-    except (OSError, ValueError, KeyError):
+        return bool(read_json(run / "run.json").get("outcome") == "running")
+    except StorageError:
         return False
 
 

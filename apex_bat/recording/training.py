@@ -69,7 +69,19 @@ class TrainingRecording:
 def rows_of(run: Path) -> Iterator[dict[str, Any]]:
     """Yields the rows of all metrics of a run, one role after the other, each in the order of time."""
     for path in sorted((run / "metrics").glob("*.jsonl")):
-        with path.open(encoding="utf-8") as lines:
+        with path.open("rb") as lines:
             for line in lines:
-                if line.endswith("\n"):  # a last line without an end is still being written
-                    yield json.loads(line)
+                row = row_of(line)
+                if row is not None:
+                    yield row
+
+
+def row_of(line: bytes) -> dict[str, Any] | None:
+    """Returns the row of metrics in a line; None for one that is still being written, or torn by a crash."""
+    if not line.endswith(b"\n"):
+        return None
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return row if isinstance(row, dict) else None

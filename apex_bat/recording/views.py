@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import rerun as rr
 import rerun.blueprint as rrb
 
 from apex_bat.recording.outlines import arena_extent_m
+from apex_bat.recording.priorities import MAP_SIZE
 from apex_bat.simulation.layout import Arena
 
 EYE_FOV_RAD = math.radians(55.0)  # vertical, the viewer's own
@@ -51,8 +53,9 @@ class Views:
         eye = rrb.EyeControls3D(
             kind="orbital", position=(-2.0, 0.0, 1.7), look_target=(1.1, 0.0, 0.1), eye_up=(0, 0, 1)
         )
+        legend = "" if self._title else " (echo: violet 20, yellow 80 dB)"  # there is no room for it beside a title
         return rrb.Spatial3DView(
-            name=self._name("Behind the bat (echo: violet 20, yellow 80 dB)"),
+            name=self._name(f"Behind the bat{legend}"),
             origin=self._path("world/bat"),
             contents=self._path("world/**"),
             eye_controls=eye,
@@ -63,10 +66,10 @@ class Views:
     def map(self) -> rrb.View:
         """Returns the view from above."""
         return rrb.Spatial3DView(
-            name=self._name("Map (vermilion: near a wall)"),
+            name=self._name("Map" if self._title else "Map (vermilion: near a wall)"),
             origin=self._path("world"),
             contents=["$origin/**", f"- {self._path('world/bat/points')}"],
-            eye_controls=None if self._arena is None else _eye_above(self._arena),
+            eye_controls=None if self._arena is None else _eye_above(self._arena, 1.05 if self._title else 1.3),
             line_grid=False,
             overrides={
                 self._path("world/trajectory"): _LASTING,
@@ -86,8 +89,9 @@ class Views:
         eye = rrb.EyeControls3D(
             kind="orbital", position=(-1.1, 0.0, 1.0), look_target=(1.0, 0.0, 0.0), eye_up=(0, 0, 1)
         )
+        legend = "" if self._title else " (violet 20, yellow 80 dB)"
         return rrb.Spatial3DView(
-            name=self._name(f"Level at the {ear} ear (violet 20, yellow 80 dB)"),
+            name=self._name(f"Level at the {ear} ear{legend}"),
             origin=self._path("world/bat"),
             contents=self._path("world/**"),
             eye_controls=eye,
@@ -167,8 +171,7 @@ class Views:
 
     def events(self) -> rrb.View:
         """Returns the list of events."""
-        columns = rrb.TextLogColumns(timeline_columns=["step"], text_log_columns=["loglevel", "body"])
-        return rrb.TextLogView(name=self._name("Events"), origin=self._path("events"), columns=columns)
+        return events(self._name("Events"), self._path("events"), "step", with_level=True)
 
     def _curves(self, name: str, *paths: str, close_up: bool = False) -> rrb.View:
         # The legends are in the names: rerun's own would cover the curves.
@@ -187,15 +190,49 @@ class Views:
         return f"{self._title}{name}"
 
 
-def curves(name: str, *paths: str, legend: rrb.Corner2D | None = None) -> rrb.View:
-    """Returns a view of the curves of some entities over the whole recording, with a legend in a corner or without."""
+def curves(name: str, *paths: str, legend: rrb.Corner2D | None = None, top: float | None = None) -> rrb.View:
+    """Returns a view of the curves of some entities over the whole recording.
+
+    Args:
+        name: title.
+        paths: of the entities.
+        legend: the corner that it is in; None: without.
+        top: the y axis goes from 0 to this; None: as far as the curves do.
+    """
     shown = HIDDEN if legend is None else rrb.PlotLegend(legend)
-    return rrb.TimeSeriesView(name=name, origin="/", contents=list(paths), plot_legend=shown, axis_x=_WHOLE)
+    # The label of the top would not be drawn on the very edge.
+    axis_y = None if top is None else rrb.ScalarAxis(range=(0.0, 1.05 * top))
+    return rrb.TimeSeriesView(
+        name=name, origin="/", contents=list(paths), plot_legend=shown, axis_x=_WHOLE, axis_y=axis_y
+    )
 
 
-def _eye_above(arena: Arena) -> rrb.EyeControls3D:
+def events(name: str, path: str, timeline: str, *, with_level: bool) -> rrb.View:
+    """Returns the list of events; their texts begin with the time, for which the viewer leaves too little room."""
+    hidden = rrb.encodings.TimelineColumn(timeline, visible=False)
+    columns: list[Literal["loglevel", "body"]] = ["loglevel", "body"] if with_level else ["body"]
+    shown = rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=columns)
+    return rrb.TextLogView(name=name, origin=path, columns=shown)
+
+
+def priorities_over_time(path: str) -> rrb.View:
+    """Returns the image of the priorities' histogram over the run so far."""
+    width, height = MAP_SIZE
+    bounds = rrb.VisualBounds2D(x_range=(-0.13 * width, 1.07 * width), y_range=(-0.03 * height, 1.25 * height))
+    name = "Priorities held (yellow: 25 %)"
+    return rrb.Spatial2DView(name=name, origin=f"{path}/over_time", visual_bounds=bounds)
+
+
+def priorities_now(path: str) -> rrb.View:
+    """Returns the bars of the priorities' histogram at the cursor."""
+    name = "Now, over log10"
+    return rrb.BarChartView(name=name, origin=path, contents="$origin", plot_legend=HIDDEN)
+
+
+def _eye_above(arena: Arena, room: float) -> rrb.EyeControls3D:
+    """Where all of an arena is seen from; with more `room` also in a panel that is narrower than high."""
     extent = arena_extent_m(arena)
     x, y = (extent.x_min + extent.x_max) / 2, (extent.y_min + extent.y_max) / 2
     half = max(extent.x_max - extent.x_min, extent.y_max - extent.y_min) / 2 + 0.5
-    height = 1.15 * half / math.tan(EYE_FOV_RAD / 2)  # the panel may be narrower than high
+    height = room * half / math.tan(EYE_FOV_RAD / 2)
     return rrb.EyeControls3D(kind="orbital", position=(x, y - 0.001, height), look_target=(x, y, 0), eye_up=(0, 1, 0))

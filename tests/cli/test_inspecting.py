@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from pyarrow import parquet  # type: ignore[import-untyped]
+from rerun.blueprint import Blueprint
 
 from apex_bat import config as configuration
 from apex_bat.agent.inference import PolicyValues
@@ -16,8 +17,9 @@ from apex_bat.cli import main
 from apex_bat.config import load
 from apex_bat.evaluation.flights import fly
 from apex_bat.experience import States
-from apex_bat.recording import screenshots, viewing
+from apex_bat.recording import blueprints, screenshots, viewing
 from apex_bat.recording.keeping import keep_flights
+from apex_bat.simulation.layout import Arena
 
 
 def straight_on(states: States) -> PolicyValues:
@@ -101,6 +103,23 @@ def test_two_runs_are_opened_as_one_recording(
     assert opened == [(["pair.rrd"], False)]
 
 
+@pytest.mark.parametrize("view", ["ear", "policy"])
+def test_two_runs_have_each_layout(
+    view: str, run: Path, monkeypatch: pytest.MonkeyPatch, opened: list[tuple[list[str], bool]]
+) -> None:
+    views: list[str] = []
+    make = blueprints.pair_blueprint
+
+    def note(arena: Arena, names: tuple[str, str], view: str) -> Blueprint:
+        views.append(view)
+        return make(arena, names, view)
+
+    monkeypatch.setattr(blueprints, "pair_blueprint", note)
+    assert inspect(monkeypatch, run, run, "--view", view) == 0
+    assert views == [view]
+    assert len(opened) == 1
+
+
 def test_screenshot_is_of_the_layout_at_the_step(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shots: list[tuple[list[str], Path, float | None]] = []
 
@@ -134,5 +153,8 @@ def test_what_is_not_there_is_one_line(
     assert says in capsys.readouterr().err
 
 
-def test_films_of_two_runs_are_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert inspect(monkeypatch, run, run, "--list") == 2
+@pytest.mark.parametrize("arguments", [["--list"], ["--view", "training"], ["--png", "a.png"]])
+def test_what_two_runs_do_not_have_together_is_refused(
+    run: Path, arguments: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert inspect(monkeypatch, run, run, *arguments) == 2

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from rerun.chunk import RrdReader
 
-from apex_bat.recording.blueprints import BLUEPRINTS, save_blueprints
+from apex_bat.recording.blueprints import BLUEPRINTS, flight_blueprint, list_recordings, pair_blueprint, save_blueprints
 from apex_bat.recording.series import SERIES
+from apex_bat.recording.viewing import PAIR_APPLICATION_ID, save_layout
 from apex_bat.simulation.layout import Arena
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "recordings.md"
@@ -30,6 +32,24 @@ def test_views_show_what_the_recording_has(recording: Path, room: Arena, tmp_pat
 
 def test_every_layout_has_views() -> None:
     assert set(BLUEPRINTS) == {"flight", "ear", "policy"}
+
+
+@pytest.mark.parametrize("view", ["flight", "ear", "policy"])
+def test_each_flight_of_a_pair_is_shown_from_its_own_entities(
+    view: str, recording: Path, room: Arena, tmp_path: Path
+) -> None:
+    path = save_layout(pair_blueprint(room, ("one", "other"), view), PAIR_APPLICATION_ID, tmp_path)
+    existing = _paths(recording)
+    origins = _origins(path)
+    assert {origin.partition("/")[0] for origin in origins} == {"a", "b"}
+    for origin in origins:
+        below = origin.partition("/")[2]
+        assert any(entity == below or entity.startswith(f"{below}/") for entity in existing), origin
+
+
+def test_layout_of_several_recordings_lists_them(room: Arena) -> None:
+    assert flight_blueprint(room).blueprint_panel.state == "collapsed"
+    assert list_recordings(flight_blueprint(room)).blueprint_panel.state == "expanded"
 
 
 def test_document_lists_every_entity_that_is_written(recording: Path) -> None:

@@ -61,6 +61,12 @@ def test_flights_are_chosen_by_merit_and_number(run: Path) -> None:
     assert chosen == {"best": 1, "worst": 0, "crash": 0, "2": 2}
 
 
+def test_the_crash_is_the_one_that_flew_longest_before(run: Path) -> None:
+    early, _, _ = list_flights(run)
+    late = replace(early, steps=early.steps + 1)
+    assert choose_flight([early, late, early], "crash") is late
+
+
 @pytest.mark.parametrize(("which", "says"), [("3", "the last is 2"), ("fastest", "best, worst, crash or a number")])
 def test_what_is_not_there_is_refused(run: Path, which: str, says: str) -> None:
     with pytest.raises(RecordingError, match=says):

@@ -140,9 +140,9 @@ def test_events_tell_the_story(recording: Path, flight: Flight) -> None:
     steps, lines = _entity(recording, "events", "TextLog:text")
     texts = [line for (line,) in lines]
     assert steps == [0, 101, flight.num_steps, flight.num_steps]
-    assert texts[0].startswith("start in room")
-    assert texts[1].startswith("near a wall")
-    assert texts[2:] == ["contact", "end: contact"]
+    assert texts[0].startswith("step 0: start in room")
+    assert texts[1].startswith("step 101: near a wall")
+    assert texts[2:] == [f"step {flight.num_steps}: contact", f"step {flight.num_steps}: end: contact"]
 
 
 def test_properties_describe_the_flight(recording: Path) -> None:

@@ -44,6 +44,13 @@ def test_first_best_worst_and_crashes_are_chosen_once_each(flights: list[Flight]
     assert marks(choose(flights, Recording(crashes=2), 2)) == {0: "crash", 1: "", 2: "crash", 3: "worst", 4: "best"}
 
 
+def test_crashes_that_flew_longest_before_are_chosen(fly: Callable[..., Flight]) -> None:
+    lengths = (4, 9, 5, 8, 3)
+    flights = [replace(flight, facts=replace(flight.facts, episode=i)) for i, flight in enumerate(map(fly, lengths))]
+    chosen = marks(choose(flights, Recording(extremes=False, crashes=2), 1))
+    assert chosen == {0: "", 1: "crash", 3: "crash"}
+
+
 def test_each_choice_can_be_switched_off(flights: list[Flight]) -> None:
     assert marks(choose(flights, Recording(extremes=False, crashes=0), 2)) == {0: "", 1: ""}
     assert marks(choose(flights, Recording(extremes=False, crashes=1), 1)) == {0: "crash"}
@@ -67,6 +74,13 @@ def test_kept_flights_carry_their_marks_in_their_names(flights: list[Flight], tm
     assert [path.stem.partition("seed3-")[2] for path in paths] == ["000000", "000003-worst", "000004-best"]
     assert {path.name for path in (tmp_path / "recordings").glob("*.rrd")} == {path.name for path in paths}
     assert len(list((tmp_path / "recordings").glob("*.rbl"))) == 3
+
+
+def test_a_flight_that_gets_another_mark_is_kept_once(flights: list[Flight], tmp_path: Path) -> None:
+    for num_first in (1, 2):
+        keep_flights(flights[:num_first], Config(), tmp_path, num_first=num_first, draw=False)
+    numbers = [path.name.partition("-00000")[2][0] for path in (tmp_path / "recordings").glob("*.rrd")]
+    assert sorted(numbers) == sorted(set(numbers))
 
 
 def test_recordings_stay_below_the_bound(flights: list[Flight], tmp_path: Path) -> None:

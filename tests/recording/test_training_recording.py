@@ -9,6 +9,7 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rerun.chunk import Chunk, RrdReader
 
@@ -16,8 +17,11 @@ from apex_bat.config import Config, load
 from apex_bat.recording.blueprints import training_blueprint
 from apex_bat.recording.curves import MEAN_S
 from apex_bat.recording.keeping import TRAINING_RECORDING
+from apex_bat.recording.priorities import MAP_SIZE
 from apex_bat.recording.reading import is_whole, read_chunks
 from apex_bat.recording.training import TrainingRecording
+from apex_bat.replay.metrics import PRIORITY_BINS
+from apex_bat.roles.metrics import DECLARED
 
 
 def row(role: str, second: int, *, pid: int = 7, state: str = "busy", **figures: Any) -> dict[str, Any]:
@@ -72,7 +76,7 @@ def test_counters_of_a_new_process_are_no_growth(tmp_path: Path) -> None:
     chunks = record(tmp_path, rows)
     assert series(chunks, "replay/rate") == []
     texts = [text for _, (text,) in series(chunks, "events", "TextLog:text")]
-    assert texts == ["replay: process 7 started", "replay: process 8 took over"]
+    assert texts == ["0:01 replay: process 7 started", "0:02 replay: process 8 took over"]
 
 
 def test_returns_are_means_over_all_episodes_of_some_seconds(tmp_path: Path) -> None:
@@ -86,10 +90,21 @@ def test_returns_are_means_over_all_episodes_of_some_seconds(tmp_path: Path) -> 
 
 
 def test_histogram_of_priorities_is_recorded_in_the_order_of_its_numbers(tmp_path: Path) -> None:
-    counts = {"replay.priority_hist.10": 3.0, "replay.priority_hist.2": 5.0}
-    chunks = record(tmp_path, [row("replay", 1) | counts])
+    shares = {f"replay.priority_hist.{k}": 0.1 * k for k in reversed(range(PRIORITY_BINS))}
+    chunks = record(tmp_path, [row("replay", 1) | shares])
     ((_, (histogram,)),) = series(chunks, "replay/priorities", "BarChart:values")
-    assert list(histogram["buffer"]) == [5.0, 3.0]
+    np.testing.assert_allclose(histogram["buffer"], 0.1 * np.arange(PRIORITY_BINS), rtol=1e-6)
+    ((time, (pixels,)),) = series(chunks, "replay/priorities/over_time", "DepthImage:buffer")
+    assert time == 1.0
+    assert series(chunks, "replay/priorities/over_time/times", "Points2D:labels") == [(1.0, ["0.0 min"] * 5)]
+    column = np.array(pixels, np.uint8).view(np.float16).reshape(MAP_SIZE[::-1])[:, 0]
+    np.testing.assert_allclose(column[::-2], 0.1 * np.arange(PRIORITY_BINS), rtol=1e-3)
+
+
+def test_image_of_the_priorities_is_drawn_every_ten_seconds_whenever_rows_are_written(tmp_path: Path) -> None:
+    shares = {f"replay.priority_hist.{k}": 0.0 for k in range(PRIORITY_BINS)}
+    chunks = record(tmp_path, [row("replay", second) | shares for second in range(1, 25)])
+    assert [time for time, _ in series(chunks, "replay/priorities/over_time", "DepthImage:buffer")] == [1.0, 11.0, 21.0]
 
 
 def test_ladder_or_the_epsilon_of_all_is_recorded(tmp_path: Path) -> None:
@@ -103,9 +118,9 @@ def test_ladder_or_the_epsilon_of_all_is_recorded(tmp_path: Path) -> None:
 
 
 def test_judgements_are_events(tmp_path: Path) -> None:
-    judged = row("evaluator", 9, state="judged the checkpoint of update 70", completed_share=0.5, progress_m=12.0)
+    judged = row("evaluator", 9, state="judged it", learner_step=70.0, completed_share=0.5, progress_m=12.0)
     ((_, (_,)), (_, (text,))) = series(record(tmp_path, [judged]), "events", "TextLog:text")
-    assert text == "judged the checkpoint of update 70: 50% complete, 12 m"
+    assert text == "0:09 update 70: 50 % complete, 12 m"
 
 
 def test_rows_of_an_earlier_part_of_the_run_come_first(tmp_path: Path) -> None:
@@ -146,3 +161,19 @@ def test_folder_that_cannot_be_written_costs_only_the_recording(tmp_path: Path) 
     training = TrainingRecording(Config(), tmp_path / "nowhere")
     training.take(row("learner", 1, loss=1.0))
     training.close()
+
+
+def test_document_lists_every_entity_that_is_written(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text(encoding="utf-8")
+    common = row("x", 20, state="judged it", pid=3)
+    rows = []
+    for role, metrics in DECLARED.items():
+        name = "actor-0" if role == "actor" else role
+        for second in (1, 20):
+            totals = {"unix_s": float(second), "elapsed_s": float(second), "role": name}
+            rows.append(common | dict.fromkeys(metrics, 1.0 * second) | totals)
+    entities = {chunk.entity_path.removeprefix("/") for chunk in record(tmp_path, rows)}
+    assert len(entities) > 20
+    for entity in entities:
+        if not entity.startswith("__properties"):
+            assert f"`{entity.replace('actor-0', 'actor-N')}`" in text, entity

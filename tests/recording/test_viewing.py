@@ -5,12 +5,13 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from apex_bat.recording import viewing
 from apex_bat.recording.blueprints import APPLICATION_ID, flight_blueprint, pair_blueprint
 from apex_bat.recording.flight import Flight
 from apex_bat.recording.reading import is_whole, read_flight
@@ -18,21 +19,89 @@ from apex_bat.recording.viewing import PAIR_APPLICATION_ID, open_viewer, save_la
 from apex_bat.simulation.layout import Arena
 
 
-def test_viewer_listens_on_this_machine_only_and_the_layout_comes_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    commands: list[list[str]] = []
+class Viewer:
+    """Instead of a viewer: notes how it was started, and ends with the code 3."""
 
-    def run(command: list[str], *, check: bool) -> SimpleNamespace:
-        assert not check
-        commands.append(command)
-        return SimpleNamespace(returncode=3)
+    commands: ClassVar[list[list[str]]] = []
 
-    monkeypatch.setattr(subprocess, "run", run)
-    assert open_viewer([Path("a.rrd"), Path("b.rrd")], Path("ear.rbl"), web=False) == 3
-    assert open_viewer([Path("a.rrd")], Path("ear.rbl"), web=True) == 3
-    native, web = (command[command.index("rerun") + 1 :] for command in commands)
-    assert native == ["a.rrd", "b.rrd", "ear.rbl", "--bind", "127.0.0.1", "--port", "auto"]
-    assert web[:4] == ["a.rrd", "ear.rbl", "--bind", "127.0.0.1"]
+    def __init__(self, command: list[str]) -> None:
+        self.commands.append(command[command.index("rerun") + 1 :])
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def poll(self) -> int | None:
+        return None
+
+    def wait(self) -> int:
+        return 3
+
+
+class Client:
+    """Instead of a connection to it: shows whichever recording was read last, as the real one does."""
+
+    is_up = False
+    known: ClassVar[list[str]] = []
+    to_read: ClassVar[list[str]] = []
+    shown = ""
+
+    @classmethod
+    def connect(cls, url: str) -> type[Client]:
+        assert url == f"rerun+http://127.0.0.1:{Viewer.commands[-1][-1]}/proxy"
+        if not cls.is_up:
+            cls.is_up, cls.to_read = True, [Viewer.commands[-1][0]]
+            raise ConnectionError("not up yet")
+        return cls
+
+    @classmethod
+    def get_state(cls) -> SimpleNamespace:
+        if cls.to_read:
+            cls.shown = cls.to_read.pop()
+            cls.known.append(cls.shown)
+        found = [SimpleNamespace(store_id=name, location=name) for name in cls.known]
+        return SimpleNamespace(recordings=found, loading=list(cls.to_read), active_recording=cls.shown)
+
+    @classmethod
+    def open(cls, urls: list[str], *, navigate: bool) -> None:
+        assert not navigate
+        cls.to_read = [Path(url).name for url in urls]
+
+    @classmethod
+    def set_location(cls, location: str) -> None:
+        assert not cls.to_read
+        cls.shown = location
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The arguments of the viewers that were started."""
+    monkeypatch.setattr(Viewer, "commands", [])
+    for name, value in (("is_up", False), ("known", []), ("to_read", []), ("shown", "")):
+        monkeypatch.setattr(Client, name, value)
+    monkeypatch.setattr(subprocess, "Popen", Viewer)
+    monkeypatch.setattr(viewing, "ViewerClient", Client)
+    monkeypatch.setattr(viewing, "_POLL_S", 0.0)
+    return Viewer.commands
+
+
+def test_viewer_listens_on_this_machine_only_and_the_layout_comes_last(started: list[list[str]]) -> None:
+    assert open_viewer([Path("a.rrd")], Path("ear.rbl"), web=False) == 3
+    assert open_viewer([Path("a.rrd"), Path("b.rrd")], Path("ear.rbl"), web=True) == 3
+    native, web = started
+    assert native[:5] == ["a.rrd", "ear.rbl", "--bind", "127.0.0.1", "--port"]
+    assert web[:5] == ["a.rrd", "b.rrd", "ear.rbl", "--bind", "127.0.0.1"]
     assert "--web-viewer" in web
+    assert not Client.is_up
+
+
+def test_the_last_recording_comes_first_with_the_layout_and_is_shown_at_the_end(started: list[list[str]]) -> None:
+    assert open_viewer([Path("c.rrd"), Path("b.rrd"), Path("a.rrd")], Path("ear.rbl"), web=False) == 3
+    assert started[0][:3] == ["a.rrd", "ear.rbl", "--bind"]
+    assert sorted(Client.known) == ["a.rrd", "b.rrd", "c.rrd"]
+    assert Client.shown == "a.rrd"
 
 
 def test_only_what_was_cut_short_is_repaired(recording: Path, flight: Flight, tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ class ReplayServer:
             self._receive()
         # The same time for learner and actors, if both want all of it: neither can crowd out the other.
         self._has_work = self._repeat(self._answer_next) | self._repeat(self._store_next)
-        if not self._has_work and self._clock() >= self._next_notice_s:
+        if self._clock() >= self._next_notice_s:
             self._notify()
         if self._snapshot_path is not None:
             self._snapshot_in_background(self._snapshot_path)

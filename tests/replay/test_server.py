@@ -118,6 +118,27 @@ def test_a_held_insert_is_not_acknowledged_and_its_actor_is_told_why(
     assert server.metrics()["replay.queued_inserts"] == 4
 
 
+def test_a_held_actor_is_told_why_although_the_server_never_rests(
+    config: Config, tmp_path: Path, make_chunk: MakeChunk, until: Until
+) -> None:
+    now = [0.0]
+    server = ReplayServer(config, "tcp://127.0.0.1:0", np.random.default_rng(0), clock=lambda: now[0])
+    actor, learner = Peer(server.address), Peer(server.address)
+    try:
+        actor.send(*(insert(make_chunk, sequence) for sequence in range(1, 8)))
+        until(lambda: server.metrics()["replay.queued_inserts"] == 4, lambda: server.serve(0.01))
+        until(lambda: any(isinstance(m, Waiting) for m in actor.got), lambda: server.serve(0.01), actor.receive)
+        actor.got.clear()
+        learner.send(SampleRequest(1, 16, 0))
+        now[0] = 60.0  # a notice is due, and the next time that the server looks up it answers the learner
+        until(lambda: server.metrics()["replay.sampled"] == 16, lambda: server.serve(0.01))
+        until(lambda: any(isinstance(m, Waiting) for m in actor.got), actor.receive)
+    finally:
+        actor.close()
+        learner.close()
+        server.close()
+
+
 def test_sampling_lets_held_inserts_in(server: ReplayServer, peer: Peer, make_chunk: MakeChunk, until: Until) -> None:
     peer.send(*(insert(make_chunk, sequence) for sequence in range(1, 8)))
     peer.send(*(SampleRequest(request, 16, 0) for request in range(20)))

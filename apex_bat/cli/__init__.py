@@ -11,7 +11,7 @@ import sys
 import typer
 
 from apex_bat import __version__
-from apex_bat.cli import adjusting, inspecting, judging, roles, training
+from apex_bat.cli import adjusting, inspecting, judging, reproducing, roles, training
 from apex_bat.config import ConfigError
 from apex_bat.launching import ONE_THREAD
 
@@ -27,6 +27,7 @@ app = typer.Typer(
 )
 app.command("train")(training.train)
 app.command("evaluate")(judging.evaluate)
+app.command("reproduce")(reproducing.reproduce)
 app.command("inspect")(inspecting.inspect)
 app.command("status")(judging.status)
 app.command("adjust")(adjusting.adjust)

@@ -56,18 +56,18 @@ def evaluate(
     if run is None:
         from apex_bat.evaluation.results import Protocol, fly_baseline
 
-        result, _ = fly_baseline(policy, config, Protocol(tuple(chosen), num_flights, start_seed))
+        result, recorded = fly_baseline(policy, config, Protocol(tuple(chosen), num_flights, start_seed))
     else:
         result, recorded = runs.evaluate(
             run, chosen, num_flights, start_seed, num_recorded=num_logged(config.recording, record),
             overrides=overrides or (),
         )  # fmt: skip
-        keep_flights(recorded, config, run, num_first=record)
     text = json.dumps(result, indent=1) + "\n"
-    if run is not None:
-        (run / "evaluation" / f"{time.strftime('%Y%m%d-%H%M%S')}.json").write_text(text, encoding="utf-8")
     if json_file is not None:
         json_file.write_text(text, encoding="utf-8")
+    if run is not None:
+        (run / "evaluation" / f"{time.strftime('%Y%m%d-%H%M%S')}.json").write_text(text, encoding="utf-8")
+        keep_flights(recorded, config, run, num_first=record)
     print_result(result, Console())
 
 

@@ -83,6 +83,7 @@ def test_an_arena_without_safe_start_is_refused(
 COMMANDS = (
     "train",
     "evaluate",
+    "reproduce",
     "inspect",
     "status",
     "arena",

@@ -119,7 +119,7 @@ def test_a_held_insert_is_not_acknowledged_and_its_actor_is_told_why(
 
 
 def test_a_held_actor_is_told_why_although_the_server_never_rests(
-    config: Config, tmp_path: Path, make_chunk: MakeChunk, until: Until
+    config: Config, make_chunk: MakeChunk, until: Until
 ) -> None:
     now = [0.0]
     server = ReplayServer(config, "tcp://127.0.0.1:0", np.random.default_rng(0), clock=lambda: now[0])

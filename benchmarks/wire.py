@@ -185,7 +185,7 @@ def _insert_delays(name: str, keys: Keys | None) -> list[Record]:
 
 def _sample_delays(name: str, keys: Keys | None) -> list[Record]:
     """Returns the time from asking for a batch of 512 to having it decoded, with nothing else going on."""
-    delays_ms = []
+    delays_ms: list[float] = []
     with ServerProcess(keys) as server:
         writer = ReplayWriter(server.address, "actor", 64, keys=keys)
         for _ in range(100):

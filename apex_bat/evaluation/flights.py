@@ -23,7 +23,7 @@ CLEARANCE_QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95)
 class Pilot(Protocol):
     """What chooses the actions of all bats of an evaluation: a network, or one of apex_bat.evaluation.baselines."""
 
-    def __call__(self, states: States) -> PolicyValues:
+    def __call__(self, states: States, /) -> PolicyValues:
         """Returns the values of all bats' actions in these states; the action of the greatest q is flown."""
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from apex_bat.config.settings import Body, Episode, Rays, Section, Sensing, Sonar
+from apex_bat.config.sections import Section
+from apex_bat.config.settings import Body, Episode, Rays, Sensing, Sonar
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE = DOCS / "simulation.md"

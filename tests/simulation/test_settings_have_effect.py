@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from apex_bat.config.settings import Body, Episode, Rays, Section, Sensing, Sonar
+from apex_bat.config.sections import Section
+from apex_bat.config.settings import Body, Episode, Rays, Sensing, Sonar
 from apex_bat.simulation.vector import EchoFlightVector
 
 SECTIONS: dict[str, type[Section]] = {

@@ -1,0 +1,126 @@
+"""`reproduce` and `evaluate --policy`: what is refused, and a whole small campaign, killed and continued."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from apex_bat.cli import main
+
+SMALL = (
+    "actors=1", "bats_per_actor=4", "sonar.rendering=exact", "replay.min_size=200", "replay.capacity=5_000",
+    "replay.samples_per_insert=2.0", "learner.batch_size=16", "learner.weights_period=5", "network.channels=[4]",
+    "network.strides=[3]", "network.hidden=[16]", "actor.chunk_transitions=10", "evaluation.flights=2",
+    "evaluation.period_s=1.0", "checkpoint.period_s=1.0", "recording.evaluation_flights=0",
+    "recording.sampled_flights=0", "recording.every_episodes=0", "episode.evaluation_steps=20",
+)  # fmt: skip
+
+
+def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    monkeypatch.setattr(sys, "argv", ["apex-bat", *arguments])
+    code = main()
+    return code, capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["reproduce", "--conditions", "memory,sight"], 2, "sight: no such condition; there are memory, "),
+        (["reproduce", "--set", "replay.never_block=true"], 2, "samples per insert"),
+        (["reproduce", "--set", "replay.shards=2"], 2, "replay.shards"),
+        (["reproduce", "--arenas", "labyrinth"], 2, "no such arena"),
+        (["reproduce", "--arenas", "corridor:0-3"], 2, "one arena at a time"),
+        (["reproduce", "--seeds", "0"], 2, "--seeds"),
+        (["reproduce", "nowhere"], 2, "--from"),
+        (["reproduce", "--from"], 2, "--from"),
+        (["reproduce", "--from", "nowhere"], 1, "no run here"),
+        (["reproduce", "--from", "nowhere", "--set", "seed=3"], 2, "change trainings"),
+        (["evaluate"], 2, "--policy"),
+        (["evaluate", "nowhere", "--policy", "ild"], 2, "one of them"),
+        (["evaluate", "--policy", "best"], 2, "random, straight, ild, oracle"),
+        (["evaluate", "--policy", "ild", "--record", "1"], 2, "--record"),
+        (["evaluate", "--policy", "ild", "--set", "episode.nonsense=1"], 2, "no such setting"),
+    ],
+)
+def test_wrong_usage_starts_nothing(
+    arguments: list[str],
+    code: int,
+    says: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result, error = run(arguments, monkeypatch, capsys)
+    assert result == code
+    assert says in error
+    assert "Traceback" not in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_baseline_is_evaluated_without_a_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "out.json"
+    arguments = ["evaluate", "--policy", "straight", "--arenas", "simple, circle", "--flights", "2", "--json",
+                 str(path), "--set", "episode.evaluation_steps=30"]  # fmt: skip
+    assert run(arguments, monkeypatch, capsys)[0] == 0
+    result = json.loads(path.read_text())
+    assert [row["arena"] for row in result["summary"]] == ["simple", "circle"]
+    assert result["run"] == "straight"
+    assert all(flight["action_shares"] == [1.0, 0.0, 0.0] for flight in result["flights"])
+
+
+def campaign(folder: Path) -> subprocess.Popen[str]:
+    """Starts a small campaign of two trainings."""
+    overrides = [argument for change in SMALL for argument in ("--set", change)]
+    command = [sys.executable, "-m", "apex_bat", "reproduce", "--seeds", "1", "--conditions", "memory,onset", "--plain",
+               "--budget", "1500", "--arenas", "simple", "--folder", str(folder), *overrides]  # fmt: skip
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+@pytest.mark.slow
+def test_a_killed_campaign_goes_on_and_ends_in_a_report(tmp_path: Path) -> None:
+    folder = tmp_path / "campaign"
+    first = campaign(folder)
+    try:
+        deadline_s = time.monotonic() + 120.0
+        while not (folder / "onset-0" / "status.json").exists():
+            assert first.poll() is None, first.communicate()[0]
+            assert time.monotonic() < deadline_s
+            time.sleep(0.05)
+    finally:
+        os.kill(first.pid, signal.SIGKILL)
+        first.communicate()
+    begun = json.loads((folder / "memory-0" / "run.json").read_text())["start"]
+    again = campaign(folder)
+    output, _ = again.communicate(timeout=300.0)
+    assert again.returncode == 0, output
+    assert "run 1 of 2: memory, seed 0: is there" in output
+    assert "run 2 of 2: onset, seed 0: was cut off and begins anew" in output
+    assert json.loads((folder / "memory-0" / "run.json").read_text())["start"] == begun, "not trained again"
+    facts = json.loads((folder / "onset-0" / "run.json").read_text())
+    assert facts["outcome"] == "completed"
+    assert facts["env_steps"] >= 1500
+    text = (folder / "report" / "report.md").read_text()
+    assert "memory 1, onset 1" in text
+    assert "other flights than the thesis's" in text
+    assert (folder / "report" / "index.html").stat().st_size > 100_000
+    evaluate_under_other_settings(folder / "memory-0", tmp_path / "out.json")
+
+
+def evaluate_under_other_settings(run: Path, path: Path) -> None:
+    """Checks that a policy flies by another rendering than it was trained with, and not with another network."""
+    command = [sys.executable, "-m", "apex_bat", "evaluate", str(run), "--arenas", "simple", "--json", str(path)]
+    subprocess.run([*command, "--set", "sonar.rendering=thesis"], check=True, capture_output=True)
+    result = json.loads(path.read_text())
+    assert result["rendering"] == "thesis"
+    assert result["changed"] == ["sonar.rendering: exact | thesis"]
+    refused = subprocess.run([*command, "--set", "sensing.memory_steps=5"], capture_output=True, text=True)
+    assert refused.returncode == 1
+    assert "the weights are of another network" in refused.stderr

@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,30 @@ from benchmarks.replay import Record, summary
 MINUTES = 0.75
 SETTLED_S = 20.0  # rows before this are left out: the replay fills, the learner has not begun
 NUM_ACTORS = (1, 2, 4)
+BEGINS = 3
 
 
 def measure() -> list[Record]:
     """Returns the records that `apex-bat bench system` writes; a run is the rows of its reports, a second each."""
-    return [record for num_actors in NUM_ACTORS for record in _measure(num_actors)]
+    begins = [_seconds_until_flight() for _ in range(BEGINS)]
+    records = [summary("system.first_step_s", "s", begins)]
+    return records + [record for num_actors in NUM_ACTORS for record in _measure(num_actors)]
+
+
+def _seconds_until_flight() -> float:
+    """Returns the time from the command to the first environment step of a run with the defaults."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "run"
+        begun_s = time.perf_counter()
+        with subprocess.Popen(
+            [sys.executable, "-m", "apex_bat", "train", "--plain", "--run", str(run)], stdout=subprocess.DEVNULL
+        ) as launcher:
+            try:
+                while not any("begins to fly" in log.read_text() for log in (run / "logs").glob("actor-*.log")):
+                    time.sleep(0.05)
+                return time.perf_counter() - begun_s
+            finally:
+                launcher.terminate()
 
 
 def _measure(num_actors: int) -> list[Record]:

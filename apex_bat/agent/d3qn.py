@@ -7,6 +7,7 @@ importance weights (Schaul et al. 2016), n-step targets, (centred) RMSprop and a
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,11 +45,18 @@ class D3QN:
         self.target = DuelingNetwork(config.network, config.state_steps).to(device)
         self.target.load_state_dict(self.online.state_dict())
         self.target.requires_grad_(False)
-        self.optimiser = _optimiser(self.online, config.learner)
         self.num_updates = 0
         self._values: tuple[Callable[..., Values], Callable[..., Values]] = (self.online, self.target)
         if config.learner.compile:
             self._values = (torch.compile(self.online), torch.compile(self.target))
+
+    @cached_property
+    def optimiser(self) -> torch.optim.Optimizer:
+        """The optimiser, made when it is first needed: for it torch imports its compiler, in 2 s of CPU (measured).
+
+        So a new learner broadcasts its first weights before, and the actors fly so much earlier.
+        """
+        return _optimiser(self.online, self._settings)
 
     def update(self, batch: Batch) -> Update:
         """Takes one step of gradient descent on a batch and copies the target network when its time has come."""

@@ -118,8 +118,8 @@ def _open_training(run: Path, show: Show) -> int:
     from apex_bat.evaluation.runs import load_config
     from apex_bat.recording.blueprints import training_blueprint
     from apex_bat.recording.curves import TRAINING_APPLICATION_ID
-    from apex_bat.recording.keeping import TRAINING_RECORDING
     from apex_bat.recording.reading import RecordingError
+    from apex_bat.recording.training import TRAINING_RECORDING
     from apex_bat.recording.viewing import save_layout
 
     path = run / "recordings" / TRAINING_RECORDING
@@ -133,8 +133,8 @@ def _open_training(run: Path, show: Show) -> int:
 def _open(run: Path, entries: Sequence[Entry], view: ViewName, show: Show, *, with_training: bool) -> int:
     """Opens recordings; the first entry is shown first."""
     from apex_bat.recording.blueprints import APPLICATION_ID, BLUEPRINTS, list_recordings
-    from apex_bat.recording.keeping import TRAINING_RECORDING
     from apex_bat.recording.reading import read_settings
+    from apex_bat.recording.training import TRAINING_RECORDING
     from apex_bat.recording.viewing import save_layout
 
     training = run / "recordings" / TRAINING_RECORDING

@@ -139,12 +139,11 @@ def _follow(
     """Trains, and notes in the run folder how it ended; exits unless it was completed."""
     from apex_bat.evaluation import runs
     from apex_bat.launching.live import PlainView, view_for
-    from apex_bat.recording.streaming import streamer
     from apex_bat.storage import StorageError
 
     view = PlainView(console) if plain else view_for(console, title)
     try:
-        with streamer(folder) if rerun else nullcontext():
+        with _streamer(folder) if rerun else nullcontext():
             ended = start(view)
     except BaseException as error:
         with suppress(StorageError):  # of a full disk, which is then the error at hand
@@ -165,6 +164,12 @@ def _follow(
             err=True,
         )
         raise typer.Exit(130)
+
+
+def _streamer(folder: Path) -> AbstractContextManager[None]:
+    from apex_bat.recording.streaming import streamer
+
+    return streamer(folder)
 
 
 def check(config: Config, *, serial: bool = False) -> None:

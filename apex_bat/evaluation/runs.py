@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -20,10 +20,12 @@ from apex_bat import config as configuration
 from apex_bat.agent.inference import Policy
 from apex_bat.config import Config
 from apex_bat.config.loading import differences
-from apex_bat.evaluation.flights import FlightRecord, fly
-from apex_bat.recording.flight import Flight
 from apex_bat.roles import checkpoint
 from apex_bat.storage import StorageError, read_json, write_text
+
+if TYPE_CHECKING:
+    from apex_bat.evaluation.flights import FlightRecord
+    from apex_bat.recording.flight import Flight
 
 FOLDERS = ("metrics", "checkpoints", "replay", "recordings", "evaluation", "figures", "logs")
 
@@ -120,6 +122,8 @@ def evaluate(
         StorageError: the checkpoint cannot be read.
         ConfigError: a change is not allowed.
     """
+    from apex_bat.evaluation.flights import fly  # here: a launcher makes run folders and need not import a simulation
+
     trained = load_config(folder)
     config = configuration.load(folder / "config.toml", overrides) if overrides else trained
     path = path or best_checkpoint(folder)

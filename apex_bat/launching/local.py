@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import msgspec
 
@@ -26,8 +26,6 @@ from apex_bat.launching.rows import RowThinner
 from apex_bat.launching.standing import NEW_RUN, Origin, Standing
 from apex_bat.launching.status import STATUS
 from apex_bat.launching.supervisor import RoleFailedError, Supervisor
-from apex_bat.recording.metrics import MetricsWriter
-from apex_bat.recording.training import TrainingRecording
 from apex_bat.roles.logs import launcher_log
 from apex_bat.roles.plan import Addresses, Role, incarnation_of, roles_of
 from apex_bat.roles.process import ADDRESSES
@@ -37,7 +35,12 @@ from apex_bat.transport.messages import Report
 from apex_bat.transport.reports import ReportCollector
 from apex_bat.transport.security import TransportError, load_keys
 
+if TYPE_CHECKING:
+    from apex_bat.recording.metrics import MetricsWriter
+
 STATUS_PERIOD_S = 1.0
+MANY_ROWS = 1000
+"""Rows of roles that do not come to fly, after which these are written all the same."""
 COMPLAINT_PERIOD_S = 60.0
 """How often a disk that takes nothing is complained of."""
 _MAX_IPC_PATH = 90  # a Unix socket's path holds 107 bytes
@@ -99,8 +102,8 @@ class _Launch:
         self._config, self._run, self._collector, self._part, self._lock = config, run, collector, part, lock
         self._supervisor = Supervisor(roles_of(config), self._start, config.launch)
         self._standing = Standing(config, time.monotonic(), origin)
-        training = TrainingRecording(config, run) if config.recording.curves else None
-        self._metrics = MetricsWriter(run / "metrics", training)
+        self._metrics: MetricsWriter | None = None
+        self._early_rows: list[Report] = []
         self._thinner = RowThinner(config.launch.dense_rows_s)
         self._began_unix_s = began_unix_s(os.getpid())
         self._status_due_s = self._complaint_due_s = 0.0
@@ -140,9 +143,12 @@ class _Launch:
             self._has_ended = True
             for row in self._thinner.rest():
                 self._append(row)
+            if self._metrics is None:
+                self._write_early_rows()
             with suppress(StorageError):
                 self._write_status()
-            self._metrics.close()
+            if self._metrics is not None:
+                self._metrics.close()
 
     def _start(self, role: Role, incarnation: int) -> RoleProcess:
         threads = self._config.train.threads if role.kind == "learner" else 1
@@ -166,9 +172,28 @@ class _Launch:
                 self._write_status()
 
     def _append(self, row: Report) -> None:
+        """Writes a row; those before the first environment step wait for it.
+
+        What writes them takes 2 s to import, which on few cores would come out of the time until the bats fly.
+        """
         standing = self._standing
+        if self._metrics is None:
+            self._early_rows.append(row)
+            if standing.flying_since_s is not None or len(self._early_rows) >= MANY_ROWS:
+                self._write_early_rows()
+            return
         with self._disk_may_be_full():
             self._metrics.append(row, standing.elapsed_s, standing.env_steps, standing.learner_step)
+
+    def _write_early_rows(self) -> None:
+        from apex_bat.recording.metrics import MetricsWriter
+        from apex_bat.recording.training import TrainingRecording
+
+        training = TrainingRecording(self._config, self._run) if self._config.recording.curves else None
+        self._metrics = MetricsWriter(self._run / "metrics", training)
+        rows, self._early_rows = self._early_rows, []
+        for row in rows:
+            self._append(row)
 
     @contextmanager
     def _disk_may_be_full(self) -> Iterator[None]:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from apex_bat.recording.keeping import TRAINING_RECORDING
 from apex_bat.recording.reading import RecordingError, read_properties
+from apex_bat.recording.training import TRAINING_RECORDING
 
 Pose = tuple[float, float, float]
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-from tensorboardX.proto.event_pb2 import Event
-from tensorboardX.record_writer import masked_crc32c
+from apex_bat.recording.tensorboard import Event, masked_crc32c
 
 FILE_VERSION = "brain.Event:2"
 

@@ -19,13 +19,12 @@ from apex_bat.recording.episodes import write_flight
 from apex_bat.recording.flight import Flight, Mark
 from apex_bat.recording.hearing import Directions
 from apex_bat.recording.picture import draw_flight
+from apex_bat.recording.training import TRAINING_RECORDING
 from apex_bat.simulation.arenas import load_arena
 from apex_bat.simulation.rays import ray_angles
 
 MOST_LOGGED = 64
 """Flights of an evaluation among which the best, the worst and the crashes are sought; each takes up to 2 MB."""
-TRAINING_RECORDING = "training.rrd"
-"""The recording of the training itself, which is no flight."""
 
 
 def num_logged(settings: Recording, num_first: int) -> int:

@@ -16,11 +16,8 @@ from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto.event_pb2 import Event
-from tensorboardX.proto.summary_pb2 import Summary
-
 from apex_bat.recording.event_file import EventFile
+from apex_bat.recording.tensorboard import Event, EventsWriter, Summary
 from apex_bat.storage import StorageError
 from apex_bat.transport.messages import Report
 

@@ -15,8 +15,9 @@ import rerun as rr
 from apex_bat.config import Config
 from apex_bat.recording.blueprints import training_blueprint
 from apex_bat.recording.curves import TRAINING_APPLICATION_ID, TrainingCurves
-from apex_bat.recording.keeping import TRAINING_RECORDING
 
+TRAINING_RECORDING = "training.rrd"
+"""The recording of the training itself, which is no flight."""
 FLUSH_PERIOD_S = 10.0
 """Seconds between writes for up to ten roles; each write of an entity takes 1 to 2 KB, so that more wait longer."""
 FLUSH_TIMEOUT_S = 10.0

@@ -6,6 +6,7 @@ algorithm 1), which are exchanged for newer ones every `actor.weights_period` st
 
 from __future__ import annotations
 
+import logging
 from contextlib import ExitStack, closing
 
 import numpy as np
@@ -25,6 +26,7 @@ from apex_bat.simulation.vector import EchoFlightVector, Observation
 from apex_bat.storage import State, joined, part_of
 from apex_bat.transport.weights import WeightsSubscriber
 
+_log = logging.getLogger(__name__)
 _WAIT_S = 0.2
 _FLUSH_S = 1.0
 
@@ -186,6 +188,7 @@ class Actor:
 
     def _begin(self) -> None:
         self._has_begun = True
+        _log.info("begins to fly")
         observation, _ = self._env.reset(seed=int(self._generator.integers(2**31)))
         self._observation, self._values = observation, self._policy(_states(observation))
         self._frames = self._env.newest_frames.copy()

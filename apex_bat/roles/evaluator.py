@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from apex_bat.agent.inference import Policy
-from apex_bat.evaluation.flights import fly, score
-from apex_bat.recording.flight import Flight
 from apex_bat.roles import checkpoint
 from apex_bat.roles.plan import Assignment
 from apex_bat.roles.reporting import RoleReporter
 from apex_bat.storage import State, StorageError, joined, part_of
 
+if TYPE_CHECKING:
+    from apex_bat.recording.flight import Flight
+
+OTHER_STARTS = 1_000_000
+"""Added to the seed of the starts. Flight k begins where seed + k says, so seeds must lie farther apart than the number
+of flights, or the best checkpoint is chosen by the very flights that judge it in the end."""
 _log = logging.getLogger(__name__)
 
 
@@ -80,6 +85,9 @@ class Evaluator:
 
     def _judge(self, path: Path) -> bool:
         """Judges a checkpoint; returns False if it was told to stop meanwhile."""
+        # Here: what flies takes 2 s to import, which at the start of a run the actors and the learner need themselves.
+        from apex_bat.evaluation.flights import fly, score
+
         try:
             found = checkpoint.load(path)
         except StorageError as error:  # removed meanwhile: a newer one will come
@@ -90,8 +98,8 @@ class Evaluator:
         num_sampled = config.recording.sampled_flights
         records, flights = fly(
             self._policy, config, config.arena, num_flights=config.evaluation.flights,
-            seed=config.evaluation.start_seed + 1, num_recorded=num_sampled, checkpoint_step=found.learner_step,
-            is_stopped=self._is_stopped,
+            seed=config.evaluation.start_seed + OTHER_STARTS, num_recorded=num_sampled,
+            checkpoint_step=found.learner_step, is_stopped=self._is_stopped,
         )  # fmt: skip
         if not records:
             return False

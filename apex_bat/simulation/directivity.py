@@ -12,8 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
-from scipy.special import j1
 
 from apex_bat.config import settings
 from apex_bat.experience import NUM_EARS
@@ -69,6 +67,8 @@ def _axis_cosine(
 
 def _piston_db(sonar: settings.Sonar, cosine: Floats) -> Floats:
     """Returns 20 log10 |2 J1(x) / x|, x = k a sin angle: a piston in a baffle; farther back is as at its side."""
+    from scipy.special import j1  # here, as below: the default needs neither, and both take a while to import
+
     sine = np.where(cosine > 0.0, np.sqrt(np.clip(1.0 - cosine**2, 0.0, 1.0)), 1.0)
     wavenumber = 2.0 * np.pi * sonar.frequency_hz / sonar.speed_of_sound_m_s
     x = np.maximum(wavenumber * sonar.piston_radius_m * sine, 1e-9)
@@ -77,6 +77,8 @@ def _piston_db(sonar: settings.Sonar, cosine: Floats) -> Floats:
 
 def _table_db(path: str, azimuth_rad: Floats, elevation_rad: Floats) -> Floats:
     """Returns the levels (..., 2, points) of a user's table, linear between its grid points."""
+    from scipy.interpolate import RegularGridInterpolator
+
     table_azimuth, table_elevation, table_db = _read_table(path)
     directions = np.stack(np.broadcast_arrays(azimuth_rad, elevation_rad), axis=-1)
     for name, grid, given in zip(

@@ -9,7 +9,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 Triangles = NDArray[np.float64]
 
@@ -50,6 +49,8 @@ def capsule_mesh(radius_m: float, length_m: float) -> Triangles:
 
 def hull_mesh(points: NDArray[np.float64]) -> Triangles:
     """Returns the convex hull of points (n, 3)."""
+    from scipy.spatial import ConvexHull  # here: it takes 0.4 s to import, and few arenas have such meshes
+
     return np.asarray(points[ConvexHull(points).simplices], np.float64)
 
 

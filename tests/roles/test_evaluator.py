@@ -6,6 +6,7 @@ import threading
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,8 +15,9 @@ from apex_bat.config import load
 from apex_bat.recording.catalog import list_flights
 from apex_bat.roles import checkpoint
 from apex_bat.roles.checkpoint import Checkpoint
-from apex_bat.roles.evaluator import Evaluator
+from apex_bat.roles.evaluator import OTHER_STARTS, Evaluator
 from apex_bat.roles.plan import Addresses, Assignment, Role
+from apex_bat.simulation.vector import EchoFlightVector
 
 SMALL = ("network.channels=[4]", "network.strides=[3]", "network.hidden=[8]", "sonar.rendering=exact",
          "evaluation.flights=2", "episode.evaluation_steps=15")  # fmt: skip
@@ -35,6 +37,19 @@ def test_as_many_flights_of_a_checkpoint_are_recorded_as_the_settings_say(sample
             evaluator.step()
     if sampled:
         (entry,) = list_flights(tmp_path)
-        assert (entry.kind, entry.checkpoint_step, entry.seed) == ("evaluation", 7, config.evaluation.start_seed + 1)
+        assert (entry.kind, entry.checkpoint_step, entry.seed) == (
+            "evaluation",
+            7,
+            config.evaluation.start_seed + OTHER_STARTS,
+        )
     else:
         assert not (tmp_path / "recordings").exists()
+
+
+def test_no_start_of_the_choice_of_the_best_is_one_of_the_final_evaluation() -> None:
+    config = load(None)
+    seeds = (config.evaluation.start_seed, config.evaluation.start_seed + OTHER_STARTS)
+    with closing(EchoFlightVector(config.evaluation.flights, config.arena)) as env:
+        final, chosen = (env.reset(seed=seed) and env.poses.copy() for seed in seeds)
+    distances_m = np.abs(final[:, None] - chosen[None]).max(axis=2)
+    assert distances_m.min() > 0.0

@@ -43,10 +43,12 @@ def _measure(batch_size: int, name: str) -> list[Record]:
     torch.manual_seed(0)
     agent = D3QN(Config(), device_of("auto"))
     served, in_memory, idle = [], [], []
-    with ServerProcess(None) as server:
+    with ServerProcess(None, batch_size) as server:
         _fill(server.address)
         reader = ReplayReader(server.address, batch_size, PREFETCH)
         batches = [batch for _ in range(IN_MEMORY) if (batch := reader.next(10.0)) is not None]
+        if len(batches) < IN_MEMORY:
+            raise RuntimeError(f"the server gave {len(batches)} batches within 10 s each: {reader.waiting}")
         turn = cycle(batches)
         for _ in range(ROUNDS):
             in_memory.append(_updates_per_s(agent, lambda: next(turn), None))

@@ -71,6 +71,7 @@ def document(measured: dict[str, dict[str, Any]]) -> str:
     for target in TARGETS:
         record = measured.get(target.name)
         if record is None:
+            lines.append(f"| {target.what} | {target.limit:,} | not measured | |")
             continue
         sign = "at least" if target.is_least else "at most"
         figures = f"{_number(record['median'])} ({_number(record['min'])}, {_number(record['max'])})"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from itertools import cycle
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,6 +20,7 @@ from apex_bat.replay.heap import keep_freed_memory
 CAPACITIES = (50_000, 1_000_000)
 BATCHES = (32, 512)
 INSERT = 50  # transitions at once
+BLOCKS = 20  # of cpprb's, in turn: what is inserted again and again would lie in the cache
 ROWS_EACH = 1.232  # of a transition, as the store reserves them for chunks of 50
 RUNS = 200
 
@@ -105,17 +107,19 @@ class _Ours:
             insert()
 
     def insert(self, size: int) -> Callable[[], object]:
-        chunk = synthetic_chunk(self.generator, size)
-        priorities = chunk.priorities + np.float32(0.001)
-        return lambda: self.buffer.add([chunk], priorities, 0, 0)
+        chunks = cycle([synthetic_chunk(self.generator, size) for _ in range(RUNS)])
+        return lambda: self._add(next(chunks))
+
+    def _add(self, chunk: Chunk) -> None:
+        self.buffer.add([chunk], chunk.priorities + np.float32(0.001), 0, 0)
 
     def sample(self, size: int) -> Callable[[], object]:
         return lambda: self.buffer.sample(size, 0.4, self.generator)
 
     def update(self, size: int) -> Callable[[], object]:
-        items = self.buffer.sample(size, 0.4, self.generator).batch.items
+        drawn = cycle([self.buffer.sample(size, 0.4, self.generator).batch.items for _ in range(RUNS)])
         errors = self.generator.random(size, dtype=np.float32) + np.float32(0.001)
-        return lambda: self.buffer.update(items, errors)
+        return lambda: self.buffer.update(next(drawn), errors)
 
 
 class _Cpprb:
@@ -139,20 +143,23 @@ class _Cpprb:
             insert()
 
     def insert(self, size: int) -> Callable[[], object]:
-        block = {
+        priorities = self.generator.random(size)
+        blocks = cycle([self._block(size) for _ in range(BLOCKS)])
+        return lambda: self.buffer.add(**next(blocks), priorities=priorities)
+
+    def _block(self, size: int) -> dict[str, Any]:
+        return {
             name: self.generator.random((size, *np.atleast_1d(field.get("shape", 1)))).astype(np.float32)
             for name, field in self.FIELDS.items()
         }
-        priorities = self.generator.random(size)
-        return lambda: self.buffer.add(**block, priorities=priorities)
 
     def sample(self, size: int) -> Callable[[], object]:
         return lambda: self.buffer.sample(size, beta=0.4)
 
     def update(self, size: int) -> Callable[[], object]:
-        indexes = self.buffer.sample(size, beta=0.4)["indexes"]
+        drawn = cycle([self.buffer.sample(size, beta=0.4)["indexes"] for _ in range(RUNS)])
         priorities = self.generator.random(size)
-        return lambda: self.buffer.update_priorities(indexes, priorities)
+        return lambda: self.buffer.update_priorities(next(drawn), priorities)
 
 
 def _cpprb(capacity: int) -> _Cpprb | None:

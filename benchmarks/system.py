@@ -40,6 +40,8 @@ def _seconds_until_flight() -> float:
         ) as launcher:
             try:
                 while not any("begins to fly" in log.read_text() for log in (run / "logs").glob("actor-*.log")):
+                    if launcher.poll() is not None:
+                        raise RuntimeError(f"the run ended with exit code {launcher.returncode} before it flew")
                     time.sleep(0.05)
                 return time.perf_counter() - begun_s
             finally:

@@ -59,16 +59,21 @@ def measure() -> list[Record]:
         return records
 
 
-def _settings(capacity: int) -> Config:
+def _settings(capacity: int, batch_size: int) -> Config:
     replay = Replay(capacity=capacity, never_block=True, snapshot_period_s=0.0)
-    return msgspec.structs.replace(Config(), replay=replay, learner=Learner(batch_size=BATCH_SIZE))
+    return msgspec.structs.replace(Config(), replay=replay, learner=Learner(batch_size=batch_size))
 
 
 def _serve(
-    addresses: Queue[str], figures: Queue[dict[str, float]], begin: Event, stop: Event, keys: Keys | None
+    addresses: Queue[str],
+    figures: Queue[dict[str, float]],
+    begin: Event,
+    stop: Event,
+    keys: Keys | None,
+    batch_size: int,
 ) -> None:
     """A process: serves until told to stop, and gives its rates since it was told to begin measuring."""
-    server = ReplayServer(_settings(CAPACITY), "tcp://127.0.0.1:0", np.random.default_rng(0), keys=keys)
+    server = ReplayServer(_settings(CAPACITY, batch_size), "tcp://127.0.0.1:0", np.random.default_rng(0), keys=keys)
     addresses.put(server.address)
     begun_s, first = time.monotonic(), server.metrics()
     is_measured = False
@@ -85,11 +90,11 @@ def _serve(
 class ServerProcess:
     """A server process and what is shared with it."""
 
-    def __init__(self, keys: Keys | None) -> None:
+    def __init__(self, keys: Keys | None, batch_size: int = BATCH_SIZE) -> None:
         addresses: Queue[str] = _processes.Queue()
         self._figures: Queue[dict[str, float]] = _processes.Queue()
         self.begin, self.stop = _processes.Event(), _processes.Event()
-        args = (addresses, self._figures, self.begin, self.stop, keys)
+        args = (addresses, self._figures, self.begin, self.stop, keys, batch_size)
         self._process = _processes.Process(target=_serve, args=args, daemon=True)
         self._process.start()
         self.address = addresses.get(timeout=60)
@@ -132,7 +137,7 @@ def _saturated(name: str, num_actors: int, batch_size: int, keys: Keys | None) -
     """Returns the rates of a server that many synthetic actors and a learner load as much as they can."""
     inserted, batches = [], []
     for _ in range(ROUNDS):
-        with ServerProcess(keys) as server:
+        with ServerProcess(keys, batch_size) as server:
             targets = [(_act, (server.address, f"actor{i}", keys, server.stop)) for i in range(num_actors)]
             clients = [_processes.Process(target=target, args=args, daemon=True) for target, args in targets]
             learner = (server.address, batch_size, keys, server.stop)
@@ -159,7 +164,7 @@ def _saturated(name: str, num_actors: int, batch_size: int, keys: Keys | None) -
 def _message_mb(batch_size: int) -> tuple[float, float]:
     """Returns what an inserted transition and a batch take on the wire, in MB of 1e6 bytes."""
     chunks = [synthetic_chunk(np.random.default_rng(0))] * CHUNKS_AT_ONCE
-    store = ReplayStore(_settings(2_000), np.random.default_rng(0))
+    store = ReplayStore(_settings(2_000, batch_size), np.random.default_rng(0))
     store.add("actor", 0, chunks)
     batch = store.sample(batch_size, 0)
     insert = encode(Insert("actor", 0, 1, 1, 0, tuple(chunks)), 0)

@@ -44,7 +44,7 @@ class D3QN:
         self.online = DuelingNetwork(config.network, config.state_steps).to(device)
         self.target = DuelingNetwork(config.network, config.state_steps).to(device)
         self.target.load_state_dict(self.online.state_dict())
-        self.target.requires_grad_(False)
+        self.target.requires_grad_(False).eval()  # dropout is for learning: no noise in targets
         self.num_updates = 0
         self._values: tuple[Callable[..., Values], Callable[..., Values]] = (self.online, self.target)
         if config.learner.compile:
@@ -67,8 +67,10 @@ class D3QN:
             self._moved(array) for array in (batch.rewards, batch.discounts, batch.weights, batch.actions)
         )
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._settings.precision == "bfloat16"):
+            self.online.eval()
             with torch.no_grad():
                 next_q_online, next_q_target = online(*next_states).q.float(), target(*next_states).q.float()
+            self.online.train()
             q = online(*states).q.float()
         errors = td_errors(q, actions, double_q_target(rewards, discounts, next_q_online, next_q_target))
         loss = weighted_loss(errors, weights, self._settings.loss)

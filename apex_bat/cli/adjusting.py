@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -15,14 +16,15 @@ def adjust(
     samples_per_insert: Annotated[float, typer.Option(help="How often each transition is sampled, from now on.")],
     error_buffer: Annotated[
         float | None,
-        typer.Option(help="Half-width of the band, in samples. [default: the least that suits the ratio]"),
+        typer.Option(help="Half-width of the band, in samples. [default: the setting, as wide as the ratio needs]"),
     ] = None,
 ) -> None:
-    """Change the replay's samples per insert while a run goes on; snapshots keep it, config.toml does not."""
+    """Change the replay's samples per insert while a run goes on; snapshots keep it, and run.json notes it."""
     from apex_bat.evaluation import runs
     from apex_bat.replay.adjusting import change_ratio
     from apex_bat.roles.plan import read_addresses
     from apex_bat.roles.process import ADDRESSES
+    from apex_bat.storage import read_json
     from apex_bat.transport.messages import RatioChange
     from apex_bat.transport.security import load_keys
 
@@ -36,4 +38,7 @@ def adjust(
         now = change_ratio(addresses.replay, change, generation=addresses.replay_generation, keys=keys)
     except ValueError as error:
         raise ConfigError(str(error)) from None
+    moment = datetime.now(UTC).isoformat(timespec="seconds")
+    entry = {"time": moment, "samples_per_insert": now.samples_per_insert, "error_buffer": now.error_buffer}
+    runs.note(run, adjusted=[*read_json(run / "run.json").get("adjusted", []), entry])
     print(f"samples per insert is now {now.samples_per_insert:g}, within {now.error_buffer:g} samples")

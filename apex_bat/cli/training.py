@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # `--help` needs none of it
     from apex_bat.launching.local import Ended
     from apex_bat.launching.standing import Origin
 
+_BYTES_A_TRANSITION = 1024  # on the wire, at most: a chunk of one transition brings four frames of 192 bytes along
 _ROLES_END_S = 3.0  # beyond their grace, until the roles of a killed launcher are gone
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="TOML file of settings; those that ship: configs/.")]
 Overrides = Annotated[
@@ -69,7 +70,7 @@ def train(
         folder, config = _create(config_file, overrides or (), run, serial=serial)
     else:
         folder, config = resume, _settings_of(resume)
-    with _locked(folder, config) as lock:
+    with locked_run(folder, config) as lock:
         lines: tuple[str, ...] = ()
         origin, part = None, 0
         if resume is not None:
@@ -85,7 +86,13 @@ def train(
         for line in (title, *lines):
             console.print(line, highlight=False, soft_wrap=True)
         start = _starter(config, folder, serial=serial, origin=origin, part=part, lock=lock)
-        _follow(start, folder, title, console, rerun=rerun, plain=plain)
+        if follow(start, folder, title, console, rerun=rerun, plain=plain).outcome == "interrupted":
+            typer.echo(
+                f"interrupted; the last checkpoint is in {folder / 'checkpoints'}; "
+                f"apex-bat train --resume {folder} goes on",
+                err=True,
+            )
+            raise typer.Exit(130)
     conclude(folder, config, console)
     return 0
 
@@ -112,7 +119,8 @@ def _settings_of(run: Path) -> Config:
     return load_config(run)
 
 
-def _locked(folder: Path, config: Config) -> AbstractContextManager[int | None]:
+def locked_run(folder: Path, config: Config) -> AbstractContextManager[int | None]:
+    """Locks a run folder, as `launching.lock.locked` says, with patience for the roles of a killed launcher."""
     from apex_bat.launching.lock import locked
     from apex_bat.launching.status import is_launched
 
@@ -133,10 +141,19 @@ def _starter(
     return lambda view: local.train(config, folder, view, origin=origin or NEW_RUN, part=part, lock=lock)
 
 
-def _follow(
-    start: Callable[[View], Ended], folder: Path, title: str, console: Console, *, rerun: bool, plain: bool
-) -> None:
-    """Trains, and notes in the run folder how it ended; exits unless it was completed."""
+def follow(
+    start: Callable[[View], Ended], folder: Path, title: str, console: Console, *, rerun: bool = False, plain: bool
+) -> Ended:
+    """Trains, and notes in the run folder how it ended; the caller holds its lock. Exits if the training failed.
+
+    Args:
+        start: trains under a view.
+        folder: of the run.
+        title: of the live view.
+        console: what the view is shown on.
+        rerun: whether to stream to a viewer.
+        plain: whether to print plain lines instead of the live view.
+    """
     from apex_bat.evaluation import runs
     from apex_bat.launching.live import PlainView, view_for
     from apex_bat.storage import StorageError
@@ -157,13 +174,7 @@ def _follow(
     if ended.outcome == "failed":
         typer.echo(f"apex-bat: {ended.reason}; the logs are in {folder / 'logs'}", err=True)
         raise typer.Exit(1)
-    if ended.outcome == "interrupted":
-        typer.echo(
-            f"interrupted; the last checkpoint is in {folder / 'checkpoints'}; "
-            f"apex-bat train --resume {folder} goes on",
-            err=True,
-        )
-        raise typer.Exit(130)
+    return ended
 
 
 def _streamer(folder: Path) -> AbstractContextManager[None]:
@@ -191,6 +202,7 @@ def check(config: Config, *, serial: bool = False) -> None:
         raise ConfigError(
             f"replay.shards is {config.replay.shards}, and training starts one replay server: set it to 1"
         )
+    _check_inserts(config)
     for arena in dict.fromkeys((config.arena, *config.evaluation.arenas)):
         load_arenas(arena)
     try:
@@ -200,6 +212,22 @@ def check(config: Config, *, serial: bool = False) -> None:
     keys = load_keys(Path(config.transport.keys)) if config.transport.keys else None
     if config.transport.host != "ipc":
         check_address(f"tcp://{config.transport.host}:{config.transport.base_port}", keys)
+
+
+def _check_inserts(config: Config) -> None:
+    """Refuses settings with which the largest insert of an actor would be refused again and again."""
+    capacity = config.replay.capacity // config.replay.shards
+    if capacity < config.largest_insert:
+        raise ConfigError(
+            f"replay.capacity {config.replay.capacity} is less than the {config.largest_insert} transitions that the "
+            f"{config.bats_per_actor} bats of an actor may send at once; give more, or fewer bats_per_actor"
+        )
+    needed_mb = config.largest_insert * _BYTES_A_TRANSITION / 2**20
+    if config.transport.max_message_mb < needed_mb:
+        raise ConfigError(
+            f"transport.max_message_mb {config.transport.max_message_mb:g} is less than the {needed_mb:.2g} MB that an "
+            f"insert of {config.largest_insert} transitions may take"
+        )
 
 
 def conclude(folder: Path, config: Config, console: Console) -> None:

@@ -80,6 +80,11 @@ class Config(Section, frozen=True):
             )
 
     @property
+    def largest_insert(self) -> int:
+        """Transitions that an actor sends at once at most: a chunk of each bat, with n - 1 more where episodes end."""
+        return (self.actor.chunk_transitions + self.learner.num_step) * self.bats_per_actor
+
+    @property
     def state_steps(self) -> int:
         """Echo frames in a state: `sensing.memory_steps`."""
         return self.sensing.memory_steps

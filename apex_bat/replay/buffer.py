@@ -206,12 +206,13 @@ class ReplayBuffer:
             ValueError: the counters or rings contradict each other; the buffer is empty then.
         """
         self._first_item, self._next_item, self._next_row = 0, 0, 0
+        num_items = counters.next_item - counters.first_item
+        if not 0 <= num_items <= self.capacity:
+            raise ValueError(f"{num_items} items do not fit a capacity of {self.capacity}")
         held = np.arange(counters.first_item, counters.next_item) % self.capacity
         items = self._items[held]
         rows, spans, priorities = items["row"], items["span"], items["priority"]
         oldest_row = max(0, counters.next_row - self.num_rows)
-        if not 0 <= counters.next_item - counters.first_item <= self.capacity:
-            raise ValueError(f"{len(held)} items do not fit a capacity of {self.capacity}")
         if len(held) and (rows.min() < oldest_row or (rows + spans).max() >= counters.next_row):
             raise ValueError("an item points at a row that is not there")
         if not (np.isfinite(priorities).all() and (priorities > 0).all()):

@@ -62,7 +62,17 @@ class RateLimiter:
         self.sampled = 0
         self._origin_inserted = min_size
         self._origin_sampled = 0
+        self._configured_buffer = error_buffer
         self._set_law(samples_per_insert, error_buffer)
+
+    def refusal(self, num_transitions: int) -> str:
+        """Returns why an insert of so many transitions would wait for ever; empty where it would not."""
+        if self.never_block or num_transitions <= self._largest_insert:
+            return ""
+        return (
+            f"{num_transitions} transitions at once; with these settings an actor sends at most {self._largest_insert}"
+            ", and the band of the rate limiter is made for that: give all hosts the same settings"
+        )
 
     @property
     def law(self) -> tuple[float, float]:
@@ -109,9 +119,14 @@ class RateLimiter:
     def change(self, samples_per_insert: float, error_buffer: float | None = None) -> None:
         """Sets another law, which holds from now on: what was owed under the old one is forgotten.
 
+        Without `error_buffer` the band of the constructor holds on where it is wide enough for the new ratio.
+
         Raises:
             ValueError: both sides could come to wait for each other; the old law stays.
         """
+        configured = self._configured_buffer
+        if error_buffer is None and configured is not None and configured >= self._least_buffer(samples_per_insert):
+            error_buffer = configured
         self._set_law(samples_per_insert, error_buffer)
         self._origin_inserted = max(self.inserted, self.min_size)
         self._origin_sampled = self.sampled
@@ -137,7 +152,7 @@ class RateLimiter:
     def _set_law(self, samples_per_insert: float, error_buffer: float | None) -> None:
         if samples_per_insert <= 0 or self.min_size < 1:
             raise ValueError("samples_per_insert must be above 0 and min_size at least 1")
-        least = (samples_per_insert * self._largest_insert + self._largest_sample) / 2
+        least = self._least_buffer(samples_per_insert)
         if error_buffer is None:
             error_buffer = max(0.1 * self.min_size * samples_per_insert, least)
         if error_buffer < least and not self.never_block:
@@ -148,3 +163,6 @@ class RateLimiter:
             )
         self.samples_per_insert = samples_per_insert
         self.error_buffer = error_buffer
+
+    def _least_buffer(self, samples_per_insert: float) -> float:
+        return (samples_per_insert * self._largest_insert + self._largest_sample) / 2

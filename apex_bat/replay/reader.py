@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from apex_bat.experience import Batch
 from apex_bat.replay.heap import keep_freed_memory
 from apex_bat.transport.messages import MessageError, PriorityUpdate, Sample, SampleRequest, Waiting, decode, encode
-from apex_bat.transport.security import Keys, TransportError
+from apex_bat.transport.security import Keys
 from apex_bat.transport.sockets import MAX_MESSAGE_BYTES, Connection
 
 ASK_AGAIN_S = 2.0  # silence of a server after which its requests go again; a living one speaks each half second
@@ -67,7 +67,7 @@ class ReplayReader:
         self._ready: deque[Batch] = deque()
         self._updates: deque[tuple[int, NDArray[np.int64], NDArray[np.float32]]] = deque(maxlen=MAX_UPDATES)
         self._arrived = threading.Condition()
-        self._error: TransportError | None = None
+        self._error: Exception | None = None
         self._stopping = False
         self._last_request = 0
         self.waited_s = 0.0
@@ -87,6 +87,7 @@ class ReplayReader:
 
         Raises:
             TransportError: a server refused our keys.
+            Exception: what else has ended the thread.
         """
         begun_s = time.monotonic()
         with self._arrived:
@@ -102,6 +103,8 @@ class ReplayReader:
 
     def update(self, items: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
         """Sends new |TD errors| of items, without waiting. One call is one update of the learner, and counted so."""
+        if len(items) != len(priorities):
+            raise ValueError(f"{len(priorities)} priorities for {len(items)} items")
         self._learner_step += 1
         if len(self._updates) == MAX_UPDATES:
             self.dropped_updates += 1
@@ -164,7 +167,7 @@ class ReplayReader:
                     self._receive(shard, server)
                     server.connection.check()
             self._send_updates()
-        except TransportError as error:
+        except Exception as error:  # whatever it is, `next` raises it: a thread that is gone would be waited for
             with self._arrived:
                 self._error = error
                 self._arrived.notify_all()
@@ -180,18 +183,20 @@ class ReplayReader:
             server = self._servers[self._last_request % len(self._servers)]
             if not server.outstanding:
                 server.heard_s = time.monotonic()
-            server.outstanding.add(self._last_request)
+            server.outstanding[self._last_request] = 0
             server.unsent.add(self._last_request)
         for server in self._servers:
             if server.is_silent(self._ask_again_s) and time.monotonic() - server.asked_again_s > self._ask_again_s:
                 server.asked_again_s = time.monotonic()  # not heard_s: `waiting` goes on saying that it is silent
-                self.asked_again += len(server.outstanding - server.unsent)
-                server.unsent |= server.outstanding
+                self.asked_again += len(server.outstanding.keys() - server.unsent)
+                server.unsent |= server.outstanding.keys()
             for request in sorted(server.unsent):
                 message = SampleRequest(request, self._batch_size, self._learner_step)
                 if not _send(server, encode(message, self._generation)):
                     break
                 server.unsent.remove(request)
+                server.num_sent += 1
+                server.outstanding[request] = server.num_sent
 
     def _send_updates(self) -> None:
         """Sends all updates that wait, as few messages."""
@@ -203,14 +208,15 @@ class ReplayReader:
         """Sends updates as one message a server; of an item that comes twice the later one counts."""
         steps, items_each, priorities_each = zip(*updates, strict=True)
         items, priorities = np.concatenate(items_each), np.concatenate(priorities_each)
+        is_sent = True
         for shard, server in enumerate(self._servers):
             mine = items % len(self._servers) == shard
             if not mine.any():
                 continue
             local = (items[mine] // len(self._servers)).astype(np.int64)
             message = PriorityUpdate(steps[-1], local, priorities[mine].astype(np.float32))
-            if not _send(server, encode(message, self._generation)):
-                self.dropped_updates += len(updates)
+            is_sent &= _send(server, encode(message, self._generation))
+        self.dropped_updates += 0 if is_sent else len(updates)
 
     def _receive(self, shard: int, server: _Server) -> None:
         while server.connection.socket.poll(0):
@@ -225,8 +231,7 @@ class ReplayReader:
             if isinstance(message, Waiting):
                 server.reason = message.reason
             elif isinstance(message, Sample) and message.request in server.outstanding:
-                server.outstanding.remove(message.request)
-                server.unsent.discard(message.request)
+                self._forget(server, message.request)
                 server.reason = ""
                 items = message.batch.items * len(self._servers) + shard
                 with self._arrived:
@@ -234,13 +239,22 @@ class ReplayReader:
                     self._ready.append(message.batch._replace(items=items))
                     self._arrived.notify_all()
 
+    def _forget(self, server: _Server, answered: int) -> None:
+        """Notes an answer. A server answers in order: what was sent before it was lost, and goes again."""
+        place = server.outstanding.pop(answered)
+        server.unsent.discard(answered)
+        lost = {request for request, sent in server.outstanding.items() if sent < place} - server.unsent
+        self.asked_again += len(lost)
+        server.unsent |= lost
+
 
 class _Server:
     """What the reader knows of one server."""
 
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
-        self.outstanding: set[int] = set()  # requests without an answer
+        self.outstanding: dict[int, int] = {}  # requests without an answer, and the how manieth to be sent each was
+        self.num_sent = 0
         self.unsent: set[int] = set()  # those of them that must still go, or go again
         self.reason = ""
         self.heard_s = time.monotonic()

@@ -9,6 +9,7 @@ asyncio costs 2.9 times its CPU (measured).
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -89,7 +90,7 @@ class ReplayServer:
         self._requests = SampleRequests()
         self._batch_size = config.learner.batch_size
         self._snapshot_path = snapshot_path
-        self._snapshot_period_s = config.replay.snapshot_period_s
+        self._snapshot_period_s = config.replay.snapshot_period_s or math.inf
         self._snapshot: SnapshotWriter | None = None
         self._generation = generation
         self._clock = clock
@@ -212,11 +213,15 @@ class ReplayServer:
     def _changed(self, change: RatioChange) -> Ratio:
         """Changes the law of the rate limiter, or says why not."""
         limiter, refused = self.store.limiter, ""
-        try:
-            limiter.change(change.samples_per_insert, change.error_buffer)
-            logger.warning("samples per insert is now %g, within %g samples", *limiter.law)
-        except ValueError as error:
-            refused = str(error)
+        if limiter.never_block:
+            refused = "replay.never_block is set: nobody waits, and the ratio is what the machine gives"
+        else:
+            try:
+                limiter.change(change.samples_per_insert, change.error_buffer)
+                logger.warning("samples per insert is now %g, within %g samples", *limiter.law)
+                self._next_snapshot_s = self._clock()  # so that a crash does not bring the old law back
+            except ValueError as error:
+                refused = str(error)
         return Ratio(*limiter.law, refused)
 
     def _arrive(self, peer: bytes, arrival: Arrival) -> None:
@@ -268,6 +273,10 @@ class ReplayServer:
         header, reason, _ = arrival
         num_transitions = _num_transitions(header)
         if isinstance(header, Insert) and not reason:
+            reason = self.store.limiter.refusal(num_transitions)
+            if reason:
+                self._refusals.count("chunk", f"{header.actor}: {reason}")
+        if isinstance(header, Insert) and not reason:
             if not self.store.can_add(num_transitions):
                 return False
             try:
@@ -317,11 +326,11 @@ class ReplayServer:
         return True
 
     def _state(self) -> dict[str, Any]:
-        return self.store.state() | {"sequences": self._arrivals.stored_sequences(), "counts": self._counts}
+        return self.store.state() | {"sequences": self._arrivals.stored_sequences(), "counts": self._counts.copy()}
 
     def _snapshot_in_background(self, path: Path) -> None:
         if self._snapshot is None:
-            if self._snapshot_period_s > 0 and self._clock() >= self._next_snapshot_s:
+            if self._clock() >= self._next_snapshot_s:
                 self._snapshot = SnapshotWriter(self.store.buffer, path)
             return
         try:

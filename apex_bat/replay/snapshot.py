@@ -240,8 +240,11 @@ def _read(path: Path, buffer: ReplayBuffer) -> dict[str, Any]:
         for entry in header["sections"]:
             _read_section(file, path, entry, arrays)
     state: dict[str, Any] = header["state"]
-    buffer.alpha = state["alpha"]
-    buffer.restore(BufferCounters(*state["buffer"]))
+    alpha, counters = float(state["alpha"]), BufferCounters(*map(int, state["buffer"]))
+    if not 0.0 <= alpha <= 1.0:
+        raise SnapshotError(f"{path}: alpha {alpha} is not between 0 and 1")
+    buffer.alpha = alpha
+    buffer.restore(counters)
     return state
 
 

@@ -55,15 +55,13 @@ class ReplayStore:
         chunk = config.actor.chunk_transitions
         context = max(config.state_steps - 1, ACTION_MEMORY)
         rows_each = ROW_RESERVE * (chunk + context + config.learner.num_step) / chunk
-        # A chunk may grow by n - 1 transitions when its episode ends, and one insert may carry one chunk a bat.
-        largest_insert = (chunk + config.learner.num_step) * config.bats_per_actor
-        num_rows = math.ceil((capacity + largest_insert) * rows_each)
+        num_rows = math.ceil((capacity + config.largest_insert) * rows_each)
         self.buffer = ReplayBuffer(capacity, num_rows, config.state_steps, config.heard_steps, settings.alpha)
         self.limiter = RateLimiter(
             settings.samples_per_insert,
             math.ceil(settings.min_size / settings.shards),
             settings.error_buffer,
-            largest_insert=largest_insert,
+            largest_insert=config.largest_insert,
             largest_sample=config.learner.batch_size,
             never_block=settings.never_block,
         )

@@ -65,6 +65,8 @@ def _verify(path: Path) -> SnapshotFacts:
         header: dict[str, Any] = json.loads(text)
         total = hashlib.sha256()
         for entry in sorted(header["sections"], key=lambda entry: (entry["name"], entry["first"])):
+            if not 0 <= entry["offset"] <= entry["offset"] + entry["bytes"] <= size:
+                raise SnapshotError(f"{path}: section {entry['name']} reaches beyond the file")
             file.seek(entry["offset"])
             data = file.read(entry["bytes"])
             if zlib.crc32(data) != entry["crc32"]:

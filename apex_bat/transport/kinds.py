@@ -118,7 +118,7 @@ class RatioChange(Header, frozen=True, tag="ratio"):
 
     samples_per_insert: Annotated[float, Meta(gt=0.0, le=1e6)]
     error_buffer: Annotated[float, Meta(ge=0.0, le=1e12)] | None = None
-    """Half-width of the band, samples; None: the least that suits the ratio."""
+    """Half-width of the band, samples; None: that of the settings, made as wide as the ratio needs."""
 
 
 class Ratio(Header, frozen=True, tag="ratio_now"):

@@ -158,3 +158,19 @@ def test_every_setting_of_the_learner_changes_what_is_learned(change: dict[str, 
         return learner.weights()["value.0.weight"]
 
     assert not np.array_equal(learn(agent()), learn(agent(**change)))
+
+
+def test_targets_are_without_dropout() -> None:
+    torch.manual_seed(0)
+    network = msgspec.structs.replace(SMALL, dropout=0.5)
+    learner = D3QN(msgspec.structs.replace(Config(), network=network, learner=Learner(learning_rate=1e-12)), CPU)
+    kinds = np.zeros(32, np.int64)
+    batch = two_state_batch(np.random.default_rng(0), 32)._replace(next_states=states(kinds))
+    seen: list[torch.Tensor] = []
+    learner.online.register_forward_hook(lambda *call: seen.append(call[2].q.detach().clone()))
+    learner.target.register_forward_hook(lambda *call: seen.append(call[2].q.detach().clone()))
+    learner.update(batch)
+    following_online, following_target, now = seen
+    assert following_online.std(dim=0).max() == 0.0, "32 times the same state"
+    assert following_target.std(dim=0).max() == 0.0
+    assert now[batch.states.echoes[:, 4, 0] == 1.0].std(dim=0).max() > 0.0, "what is learned has dropout"

@@ -29,6 +29,8 @@ def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         (["train", "--set", "transport.host=0.0.0.0"], 1, "not a loopback address, so it needs CURVE keys"),
         (["train", "--set", "transport.keys=nowhere"], 1, "nowhere"),
         (["train", "--set", "replay.shards=2"], 2, "replay.shards is 2, and training starts one replay server"),
+        (["train", "--set", "replay.capacity=600", "--set", "replay.min_size=100"], 2, "less than the 848 transitions"),
+        (["train", "--set", "transport.max_message_mb=0.1"], 2, "less than the 0.83 MB"),
         (["train", "--nonsense"], 2, "No such option"),
         (["train", "--resume", "nowhere"], 1, "nowhere: no run here"),
         (["train", "--resume", "nowhere", "--run", "somewhere"], 2, "give one of them"),

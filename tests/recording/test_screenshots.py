@@ -11,9 +11,8 @@ from PIL import Image
 
 from apex_bat.config import Config
 from apex_bat.recording.blueprints import pair_blueprint, save_blueprints
-from apex_bat.recording.training import TRAINING_RECORDING
 from apex_bat.recording.screenshots import SIZE, ScreenshotError, take_screenshot
-from apex_bat.recording.training import TrainingRecording
+from apex_bat.recording.training import TRAINING_RECORDING, TrainingRecording
 from apex_bat.recording.viewing import PAIR_APPLICATION_ID, save_layout, write_pair
 from apex_bat.roles.metrics import DECLARED
 from apex_bat.simulation.layout import Arena

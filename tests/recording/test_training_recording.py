@@ -16,10 +16,9 @@ from rerun.chunk import Chunk, RrdReader
 from apex_bat.config import Config, load
 from apex_bat.recording.blueprints import training_blueprint
 from apex_bat.recording.curves import MEAN_S
-from apex_bat.recording.training import TRAINING_RECORDING
 from apex_bat.recording.priorities import MAP_SIZE
 from apex_bat.recording.reading import is_whole, read_chunks
-from apex_bat.recording.training import TrainingRecording
+from apex_bat.recording.training import TRAINING_RECORDING, TrainingRecording
 from apex_bat.replay.metrics import PRIORITY_BINS
 from apex_bat.roles.metrics import DECLARED
 

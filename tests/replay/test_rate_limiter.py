@@ -130,3 +130,13 @@ def test_the_measured_ratio_counts_from_the_first_sample() -> None:
     one.count_insert(30)
     one.count_sample(40)
     assert one.measured_ratio == 2.0
+
+
+def test_a_changed_ratio_keeps_the_band_of_the_settings_where_it_is_wide_enough() -> None:
+    limiter = RateLimiter(8.0, 100, 5_000.0, largest_insert=50, largest_sample=64)
+    limiter.change(4.0)
+    assert limiter.law == (4.0, 5_000.0)
+    limiter.change(1_000.0)
+    assert limiter.law == (1_000.0, (1_000.0 * 50 + 64) / 2)
+    limiter.change(4.0, 300.0)
+    assert limiter.law == (4.0, 300.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
@@ -179,12 +180,40 @@ def test_closing_is_quick_without_a_server(address: str) -> None:
 
 
 def test_updates_that_wait_go_together_and_the_last_of_an_item_counts(
-    server: ReplayServer, reader: ReplayReader, make_chunk: MakeChunk, until: Until
+    server: ReplayServer, reader: ReplayReader, make_chunk: MakeChunk, until: Until, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server.store.add("a", 0, [make_chunk(10)])
     until(lambda: server.metrics()["replay.queued_requests"] == 3, lambda: server.serve(0.01))
+    sizes: list[int] = []
+    update = server.store.update
+    monkeypatch.setattr(server.store, "update", lambda *given: (sizes.append(len(given[1])), update(*given)))
     for step, priority in enumerate((0.5, 0.25), start=1):
         reader.update(np.array([3, 4 + step]), np.full(2, priority, np.float32))
     until(lambda: server.store.learner_step == 2, lambda: server.serve(0.01))
+    assert sizes == [4]
     priorities = server.store.buffer.item_arrays()["items"]["priority"]
     np.testing.assert_allclose(priorities[[3, 5, 6]], [0.25, 0.5, 0.25], rtol=1e-4)
+
+
+def test_requests_that_were_lost_go_again_although_others_are_answered(
+    server: ReplayServer, address: str, make_chunk: MakeChunk, until: Until
+) -> None:
+    with closing(ReplayReader(address, 16, 8, ask_again_s=60.0)) as reader:
+        until(lambda: server.metrics()["replay.queued_requests"] == 8, lambda: server.serve(0.0))
+        requests = server._requests  # lost here stands for lost on the way
+        for _ in range(5):
+            requests.take()
+        server.store.add("a", 0, [make_chunk(40)])
+        batches(server, reader, 40)
+        assert reader.counters()["reader.asked_again"] == 5
+
+
+def test_what_ends_the_thread_is_raised_instead_of_waited_for(reader: ReplayReader, until: Until) -> None:
+    reader._updates.append((1, np.arange(2), np.zeros(3, np.float32)))
+    with pytest.raises(IndexError, match="boolean index"):
+        until(lambda: False, lambda: reader.next(0.01))
+
+
+def test_priorities_that_do_not_fit_their_items_are_refused(reader: ReplayReader) -> None:
+    with pytest.raises(ValueError, match="3 priorities for 2 items"):
+        reader.update(np.arange(2), np.zeros(3, np.float32))

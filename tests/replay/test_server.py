@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +19,8 @@ from apex_bat.replay.adjusting import change_ratio
 from apex_bat.replay.client import ReplayReader, ReplayWriter
 from apex_bat.replay.metrics import METRICS, READER_METRICS, WRITER_METRICS, declared_name
 from apex_bat.replay.server import ReplayServer
-from apex_bat.replay.snapshot import SnapshotError
+from apex_bat.replay.snapshot import SnapshotError, read_snapshot
+from apex_bat.replay.store import ReplayStore
 from apex_bat.transport.messages import (
     Ack,
     Insert,
@@ -289,6 +291,43 @@ def test_a_ratio_that_could_lead_to_a_standstill_is_refused_with_the_reason(serv
     with serving(server), pytest.raises(ValueError, match="wait for each other for ever"):
         change_ratio(server.address, RatioChange(2.0, error_buffer=1.0))
     assert server.store.limiter.law == law
+
+
+def test_a_ratio_is_not_changed_where_nobody_keeps_it(config: Config) -> None:
+    replay = msgspec.structs.replace(config.replay, never_block=True)
+    server = ReplayServer(msgspec.structs.replace(config, replay=replay), "tcp://127.0.0.1:0", np.random.default_rng(0))
+    try:
+        with serving(server), pytest.raises(ValueError, match="never_block"):
+            change_ratio(server.address, RatioChange(2.0))
+    finally:
+        server.close()
+
+
+def test_a_changed_ratio_is_in_a_snapshot_at_once_also_where_none_are_periodic(config: Config, tmp_path: Path) -> None:
+    path = tmp_path / "snapshot"
+    server = ReplayServer(config, "tcp://127.0.0.1:0", np.random.default_rng(0), path)
+    try:
+        with serving(server):
+            change_ratio(server.address, RatioChange(2.0))
+            ends_s = time.monotonic() + 20.0
+            while not path.exists():
+                assert time.monotonic() < ends_s
+                time.sleep(0.01)
+    finally:
+        server.close()
+    state, _ = read_snapshot(path, ReplayStore(config, np.random.default_rng(0)).buffer)
+    assert state["law"][0] == 2.0
+
+
+def test_an_insert_that_could_never_be_let_in_is_refused_and_stops_nobody(
+    server: ReplayServer, peer: Peer, make_chunk: MakeChunk, until: Until
+) -> None:
+    peer.send(insert(make_chunk, 1, transitions=60), insert(make_chunk, 2, transitions=10))
+    until(lambda: sum(isinstance(m, Ack) for m in peer.got) == 2, lambda: server.serve(0.01), peer.receive)
+    refused, stored = (m for m in peer.got if isinstance(m, Ack))
+    assert "60 transitions at once" in refused.refused
+    assert not stored.refused
+    assert server.metrics()["replay.refused"] == 60
 
 
 def test_nobody_who_does_not_know_the_generation_changes_the_ratio(server: ReplayServer) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -156,3 +158,37 @@ def test_an_abandoned_snapshot_leaves_nothing(tmp_path: Path, make_chunk: MakeCh
 def test_no_snapshot_is_no_restart_from_nothing_in_silence(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no snapshot"):
         read_snapshot(tmp_path / "replay", new_buffer())
+
+
+def forged(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """Rewrites the header of a snapshot, with a right checksum."""
+    data = path.read_bytes()
+    magic, version, _, offset, length = snapshot.PREFIX.unpack_from(data)
+    header = json.loads(data[offset : offset + length])
+    change(header)
+    text = json.dumps(header).encode()
+    prefix = snapshot.PREFIX.pack(magic, version, zlib.crc32(text), offset, len(text))
+    path.write_bytes(prefix + data[snapshot.PREFIX.size : offset] + text)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda header: header["state"].update(alpha="x"),
+        lambda header: header["state"].update(alpha=7.0),
+        lambda header: header["state"].update(buffer=[0, 10**12, 0]),
+        lambda header: header["state"].update(buffer=[0, 10, "many"]),
+        lambda header: header["sections"][0].update(bytes=2**40),
+    ],
+    ids=["alpha is text", "alpha beyond 1", "a million million items", "counters are text", "a section of a terabyte"],
+)
+def test_a_forged_header_is_refused_and_the_file_before_is_used(
+    change: Callable[[dict[str, Any]], None], tmp_path: Path, make_chunk: MakeChunk
+) -> None:
+    path, buffer, restored = tmp_path / "replay", new_buffer(), new_buffer()
+    add(buffer, make_chunk(10))
+    save(buffer, path)
+    save(buffer, path)
+    forged(path, change)
+    assert read_snapshot(path, restored)[1] == previous_of(path)
+    assert len(restored) == 10

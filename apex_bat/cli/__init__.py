@@ -87,6 +87,8 @@ def _report(error: Exception) -> int:
     for kind in type(error).__mro__:
         if kind.__name__ in known and kind.__module__.startswith("apex_bat."):
             return _line(error, known[kind.__name__])
+    if isinstance(error, OSError) and error.filename:
+        return _line(OSError(f"{error.filename}: {error.strerror}"), 1)
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("apex_bat"):
         print(f"apex-bat: {error.name} is not installed; pip install 'apex-bat[train]' brings it", file=sys.stderr)
         return 1

@@ -40,6 +40,7 @@ def evaluate(
     from apex_bat.evaluation import runs
     from apex_bat.recording.keeping import keep_flights, num_logged
     from apex_bat.simulation.arenas import load_arenas
+    from apex_bat.storage import write_text
 
     if (run is None) != bool(policy):
         raise typer.BadParameter("give a run folder or --policy, one of them", param_hint="RUN")
@@ -62,13 +63,13 @@ def evaluate(
             run, chosen, num_flights, start_seed, num_recorded=num_logged(config.recording, record),
             overrides=overrides or (),
         )  # fmt: skip
+    print_result(result, Console())  # first: a full disk must not cost it
     text = json.dumps(result, indent=1) + "\n"
     if json_file is not None:
         json_file.write_text(text, encoding="utf-8")
     if run is not None:
-        (run / "evaluation" / f"{time.strftime('%Y%m%d-%H%M%S')}.json").write_text(text, encoding="utf-8")
+        write_text(run / "evaluation" / f"{time.strftime('%Y%m%d-%H%M%S')}.json", text)
         keep_flights(recorded, config, run, num_first=record)
-    print_result(result, Console())
 
 
 def status(run: RunFolder, json_file: Json = None) -> None:

@@ -234,6 +234,7 @@ def conclude(folder: Path, config: Config, console: Console) -> None:
     """Evaluates the best checkpoint of a run, records flights of it, prints the result and where everything is."""
     from apex_bat.evaluation import runs
     from apex_bat.recording.keeping import keep_flights, num_logged
+    from apex_bat.storage import write_text
 
     evaluation, num_first = config.evaluation, config.recording.evaluation_flights
     if not evaluation.arenas:
@@ -246,9 +247,9 @@ def conclude(folder: Path, config: Config, console: Console) -> None:
         folder, evaluation.arenas, evaluation.flights, evaluation.start_seed,
         num_recorded=num_logged(config.recording, num_first),
     )  # fmt: skip
-    (folder / "evaluation" / "final.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    print_result(result, console)  # first: a full disk must not cost it
+    write_text(folder / "evaluation" / "final.json", json.dumps(result, indent=1) + "\n")
     keep_flights(flights, config, folder, num_first=num_first)
-    print_result(result, console)
     console.print(f"run folder:  {folder}\nrecordings:  apex-bat inspect {folder}\n"
                   f"pictures:    {folder / 'figures'}", highlight=False, soft_wrap=True)  # fmt: skip
 

@@ -212,6 +212,7 @@ def _commit() -> str | None:
     """Returns the commit of the source tree, with a plus if it was changed; None outside a checkout."""
     source = Path(__file__).resolve().parent
     try:
+        _git("ls-files", "--error-unmatch", "__init__.py", source=source)  # else it is somebody else's repository
         commit = _git("rev-parse", "HEAD", source=source)
         return commit + ("+" if _git("status", "--porcelain", source=source) else "")
     except (OSError, subprocess.SubprocessError):

@@ -23,7 +23,7 @@ from apex_bat.storage import State, StorageError, read_arrays, sync_folder, writ
 FOLDER = "serial"
 KIND = "apex_bat serial state 1"
 NUM_KEPT = 2
-_STATE, _REPLAY, _BEST = "state.npz", "replay.snapshot", (checkpoint.BEST, "best.json")
+_STATE, _REPLAY, _BEST = "state.npz", "replay.snapshot", (checkpoint.BEST,)
 _NAME = re.compile(r"turn-(\d{12})")
 _log = logging.getLogger(__name__)
 

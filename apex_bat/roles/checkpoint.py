@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import re
-import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_bat.config import Config
-from apex_bat.storage import StorageError, read_arrays, read_json, write_arrays, write_text
+from apex_bat.storage import StorageError, read_arrays, write_arrays
 
 KIND = "apex_bat checkpoint 1"
 BEST = "best.npz"
@@ -61,12 +60,7 @@ def save(folder: Path, checkpoint: Checkpoint, keep: int) -> Path:
         StorageError: it could not be written; older ones are untouched.
     """
     path = folder / f"step-{checkpoint.learner_step:09d}.npz"
-    header = {
-        "learner_step": checkpoint.learner_step,
-        "fingerprint": checkpoint.fingerprint,
-        "counters": checkpoint.counters,
-    }
-    write_arrays(path, KIND, header, checkpoint.arrays)
+    _write(path, checkpoint)
     for old in find(folder)[:-keep]:
         old.unlink(missing_ok=True)
     return path
@@ -120,32 +114,42 @@ def step_of(path: Path) -> int:
     return int(match[1])
 
 
-def mark_best(folder: Path, path: Path, score: tuple[float, ...]) -> bool:
-    """Keeps a copy of a checkpoint as the best if its score is at least that of the best so far; says whether.
+def mark_best(folder: Path, checkpoint: Checkpoint, score: tuple[float, ...]) -> bool:
+    """Keeps a checkpoint as the best if its score is at least that of the best so far; says whether.
+
+    Score and checkpoint are one file, so that no kill can part them; and it is written from memory, so that it does not
+    matter whether the numbered file was removed while it was judged.
 
     Raises:
         StorageError: it could not be written; the best so far is untouched.
     """
-    note = folder / "best.json"
-    if note.exists() and _noted_score(note) > score:
+    path = folder / BEST
+    if path.exists() and _score_of(path) > score:
         return False
-    beside = folder / ".best.part"
-    try:
-        shutil.copyfile(path, beside)
-        beside.replace(folder / BEST)
-    except FileNotFoundError:  # it was removed while it was judged
-        return False
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise StorageError(f"{folder / BEST}: cannot be written: {error.strerror or error}") from None
-    write_text(note, json.dumps({"score": score, "checkpoint": path.name}))
+    _write(path, checkpoint._replace(counters=checkpoint.counters | {"score": list(score)}))
     return True
 
 
-def _noted_score(note: Path) -> tuple[float, ...]:
-    """Returns the score of the best checkpoint so far; the least of all if the note of it is damaged."""
+def set_torn_aside(folder: Path, newest: Checkpoint) -> None:
+    """Renames checkpoints beyond the newest that can be read: by their names they would stay the newest."""
+    for path in find(folder):
+        if step_of(path) > newest.learner_step:
+            path.replace(path.with_name(path.name + ".torn"))
+
+
+def _write(path: Path, checkpoint: Checkpoint) -> None:
+    header = {
+        "learner_step": checkpoint.learner_step,
+        "fingerprint": checkpoint.fingerprint,
+        "counters": checkpoint.counters,
+    }
+    write_arrays(path, KIND, header, checkpoint.arrays)
+
+
+def _score_of(path: Path) -> tuple[float, ...]:
+    """Returns the score of the best checkpoint so far; the least of all if it is damaged."""
     try:
-        return tuple(msgspec.convert(read_json(note).get("score"), list[float]))
+        return tuple(msgspec.convert(load(path).counters.get("score"), list[float]))
     except (StorageError, msgspec.ValidationError) as error:
-        _log.warning("%s: not read, the next checkpoint counts as the best: %s", note, error)
+        _log.warning("%s: not read, the next checkpoint counts as the best: %s", path, error)
         return ()

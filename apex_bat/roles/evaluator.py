@@ -105,7 +105,7 @@ class Evaluator:
             return False
         result = score(records)
         try:
-            checkpoint.mark_best(path.parent, path, result)
+            checkpoint.mark_best(path.parent, found, result)
         except StorageError as error:
             _log.error("the best checkpoint is not kept: %s", error)
         self._reporter.count("evaluations", 1)

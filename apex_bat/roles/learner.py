@@ -49,7 +49,10 @@ def run_learner(assignment: Assignment) -> None:
             for reason in PUBLISHER_REASONS:
                 reporter.gauge(f"weights.refused.{reason}", publisher.refusals.counts.get(reason, 0))
         learner.report("writing the last checkpoint")
-        learner.save()
+        try:
+            learner.save()
+        except StorageError as error:  # of a full disk: the one before is the last, and the run has ended as asked
+            _log.error("no last checkpoint: %s", error)
 
 
 def make_agent(assignment: Assignment) -> tuple[D3QN, int]:
@@ -67,6 +70,7 @@ def make_agent(assignment: Assignment) -> tuple[D3QN, int]:
         return agent, 0
     if found.fingerprint != checkpoint.fingerprint(config):
         raise ConfigError(f"{folder}: the newest checkpoint is of another network, sensing or condition")
+    checkpoint.set_torn_aside(folder, found)
     agent.restore(found.arrays, found.learner_step)
     _restore_random_state(found.counters["torch_random"])
     _log.info("continues from the checkpoint of update %d", found.learner_step)

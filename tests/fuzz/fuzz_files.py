@@ -135,8 +135,8 @@ def _arena(content: bytes) -> object:
 
 
 def _best(content: bytes) -> object:
-    _file(content, "checkpoints/best.json")
-    return checkpoint.mark_best(_folder() / "checkpoints", _folder() / "checkpoints" / "one", (0.25,))
+    _file(content, f"checkpoints/{checkpoint.BEST}")
+    return checkpoint.mark_best(_folder() / "checkpoints", checkpoint.Checkpoint(1, {}, {}, {}), (0.25,))
 
 
 def _keys(content: bytes) -> object:

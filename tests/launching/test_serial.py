@@ -99,7 +99,7 @@ def test_it_is_a_run_with_everything(whole: Path) -> None:
     names = content(whole).keys()
     roles = ("actor-0", "actor-1", "learner", "replay", "evaluator")
     assert {f"metrics/{role}.jsonl" for role in roles} <= names
-    assert {"checkpoints/best.npz", "checkpoints/best.json", "metrics/tensorboard/events.out.tfevents.serial"} <= names
+    assert {"checkpoints/best.npz", "metrics/tensorboard/events.out.tfevents.serial"} <= names
     assert len(serial_state.find(whole)) == 2, "the newest two states are kept"
     assert not list(whole.rglob("*.part"))
 

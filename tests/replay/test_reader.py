@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from apex_bat.config.settings import Config
 from apex_bat.experience import Batch, Chunk
@@ -186,7 +187,12 @@ def test_updates_that_wait_go_together_and_the_last_of_an_item_counts(
     until(lambda: server.metrics()["replay.queued_requests"] == 3, lambda: server.serve(0.01))
     sizes: list[int] = []
     update = server.store.update
-    monkeypatch.setattr(server.store, "update", lambda *given: (sizes.append(len(given[1])), update(*given)))
+
+    def counted(step: int, items: NDArray[np.int64], errors: NDArray[np.float32]) -> None:
+        sizes.append(len(items))
+        update(step, items, errors)
+
+    monkeypatch.setattr(server.store, "update", counted)
     for step, priority in enumerate((0.5, 0.25), start=1):
         reader.update(np.array([3, 4 + step]), np.full(2, priority, np.float32))
     until(lambda: server.store.learner_step == 2, lambda: server.serve(0.01))

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 from apex_bat.roles.resources import began_unix_s
 from benchmarks import chaos_report
-from benchmarks.chaos_report import Fault, Sample, Timeline, is_flowing
+from benchmarks.chaos_report import END_MARGIN_PERIODS, Course, Fault, Sample, Timeline, is_flowing
 
 KINDS = (
     "kill actor", "kill replay", "kill learner", "kill evaluator", "kill two", "stop one", "kill in checkpoint",
@@ -38,8 +38,9 @@ LOOK_S, WATCH_S = 0.05, 0.0005
 """Time between looks at status.json, and at a folder in which a file is about to be written."""
 WARM_UP_S = 10.0
 """Undisturbed flight before the first fault."""
-END_MARGIN_PERIODS = 2.5
 WATCH_FOR_S = 40.0
+START_S, FLOW_PERIODS = 180.0, 10.0
+"""How long all roles may take until they work, at the start, and after a fault, in periods of the schedule."""
 END_S = 600.0
 """How long the evaluation after training may take."""
 
@@ -91,6 +92,11 @@ class Run:
         except (OSError, ValueError):
             return None
         return self.timeline.take(content, time.time())
+
+    def roles(self) -> list[str]:
+        """Returns the names of all roles; none before the first status."""
+        newest = self.timeline.newest
+        return [] if newest is None else [*newest.roles]
 
     def pid(self, role: str) -> int | None:
         """Returns the present process of a role."""
@@ -155,52 +161,59 @@ def _wait_for_file(run: Run, kind: str) -> bool:
     return False
 
 
-def disturb(run: Run, options: Options) -> list[Fault]:
-    """Hits roles until the training is nearly over; returns the faults."""
-    generator, faults = random.Random(options.seed), []  # noqa: S311  # a schedule, no secret
+def disturb(run: Run, options: Options) -> Course:
+    """Hits roles until the training is nearly over, or until they do not work again; returns how it went."""
+    generator = random.Random(options.seed)  # noqa: S311  # a schedule, no secret
+    faults: list[Fault] = []
     kinds = schedule(generator)
-    run.wait_for_flow(180.0)
+    if not run.wait_for_flow(START_S):
+        return Course(faults, options.period_s, f"not all roles worked within {START_S:g} s of the start")
     began_s = time.time()
     run.look_until(began_s + min(WARM_UP_S, options.period_s))
     while run.process.poll() is None:
         if time.time() - began_s > 60.0 * options.minutes - END_MARGIN_PERIODS * options.period_s:
             break  # the last fault is recovered from before the end, so that its time can be measured
-        newest = run.timeline.newest
-        if newest is None or not run.wait_for_flow(10.0 * options.period_s):
-            break
+        if not run.wait_for_flow(FLOW_PERIODS * options.period_s):
+            if run.process.poll() is not None:  # it ended meanwhile; whether as asked, its exit code tells
+                break
+            return Course(faults, options.period_s, f"not all roles worked again after {time.time() - began_s:.0f} s")
         kind = next(kinds)
-        names = victims(kind, [*newest.roles], generator)
+        names = victims(kind, run.roles(), generator)
         fault = inject(run, kind, names)
         if fault is not None:
             faults.append(fault)
             print(f"{time.time() - began_s:6.1f} s  {kind}: {', '.join(names)}", flush=True)
         run.look_until(time.time() + options.period_s)
-    return faults
+    return Course(faults, options.period_s, "")
 
 
 def train_disturbed(folder: Path, options: Options) -> dict[str, Any]:
     """Runs the training with its faults and returns what came of it."""
     run = Run(folder, options, options.minutes)
     try:
-        faults = disturb(run, options)
+        course = disturb(run, options)
         run.look_until(time.time() + 60.0 * options.minutes + END_S)
-        return chaos_report.report(folder, run.timeline, faults, run.process.poll())
+        return chaos_report.report(folder, run.timeline, course, run.process.poll())
     finally:
         run.end()
 
 
-def kill_launcher(folder: Path, options: Options) -> float:
-    """Kills the launcher of another run and returns how long its roles live on, in s."""
+def kill_launcher(folder: Path, options: Options) -> dict[str, Any]:
+    """Kills the launcher of another run and returns how long its roles live on, in s, and what they leave."""
     run = Run(folder, options, 5.0)
     try:
-        run.wait_for_flow(180.0)
-        pids = [run.pid(name) for name in (run.timeline.newest.roles if run.timeline.newest else ())]
+        run.wait_for_flow(START_S)
+        pids = [pid for pid in map(run.pid, run.roles()) if pid is not None]
         run.process.kill()
         run.process.wait()
         killed_s = time.time()
-        while any(began_unix_s(pid) is not None for pid in pids if pid) and time.time() < killed_s + 60.0:
+        while any(began_unix_s(pid) is not None for pid in pids) and time.time() < killed_s + 60.0:
             time.sleep(LOOK_S)
-        return round(time.time() - killed_s, 2) if pids else float("nan")
+        return {
+            "roles_ended_after_s": round(time.time() - killed_s, 2) if pids else float("nan"),
+            "processes": chaos_report.processes_of(folder),
+            "leftovers": chaos_report.leftovers_of(folder, run.process.pid),
+        }
     finally:
         run.end()
 
@@ -221,15 +234,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     try:
         result = train_disturbed(folder / "run", options)
-        result |= {"launcher_killed": {"roles_ended_after_s": kill_launcher(folder / "short", options)}}
+        result |= {"launcher_killed": kill_launcher(folder / "short", options)}
     finally:
         if given.keep is None:
             shutil.rmtree(folder, ignore_errors=True)
     result |= {"minutes": given.minutes, "period_s": given.period, "seed": given.seed, "cores": os.cpu_count(),
                "settings": [*options.settings], "config": given.config}  # fmt: skip
-    result["checks"]["children of a killed launcher end within 10 s"] = (
-        result["launcher_killed"]["roles_ended_after_s"] <= 10.0
-    )
+    killed = result["launcher_killed"]
+    result["checks"] |= {
+        "children of a killed launcher end within 10 s": killed["roles_ended_after_s"] <= 10.0,
+        "they leave no process and no unfinished file": not killed["processes"] and not killed["leftovers"],
+    }
     if given.json:
         given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     print(chaos_report.document(result))

@@ -24,8 +24,10 @@ GROWTH_SHARE, GROWTH_MB, GROWTH_FILES = 0.15, 40.0, 10
 """How much memory and open files of a role may differ between the first and the last third of a run."""
 SETTLED_S = 8.0
 """Age from which a process's memory is compared."""
-CUT_OFF_S = 40.0
-"""A fault so short before the end need not have been recovered from."""
+END_MARGIN_PERIODS = 2.5
+"""How long before the end of training the last fault comes, in periods of the schedule."""
+RECOVERY_S, MOST_CUT_OFF_S = 15.0, 40.0
+"""What a recovery may take; and how short before the end a fault need not have been recovered from, at most."""
 BEGIN, END = "<!-- chaos: begin -->\n", "\n<!-- chaos: end -->"
 _RESTORED = re.compile(r"continues: replay: \d+ transitions, (\d+) ever inserted")
 
@@ -39,6 +41,16 @@ class Fault(NamedTuple):
     at_unix_s: float
     saved_unix_s: float | None
     """When the newest snapshot of the replay had been written; None: there was none."""
+
+
+class Course(NamedTuple):
+    """How the faults of a run came, one after the other."""
+
+    faults: Sequence[Fault]
+    period_s: float
+    """Between two faults."""
+    stuck: str
+    """What did not work again in time, so that no more faults came; empty: none."""
 
 
 class Sample(NamedTuple):
@@ -92,22 +104,30 @@ def is_flowing(role: str, timeline: Timeline, sample: Sample | None = None) -> b
     return bool(metrics.get(work, 0) > 0)
 
 
-def report(folder: Path, timeline: Timeline, faults: Sequence[Fault], code: int | None) -> dict[str, Any]:
+def cut_off_s(period_s: float) -> float:
+    """Returns how short before the end a fault need not have been recovered from, of a schedule with such a period."""
+    return min(END_MARGIN_PERIODS * period_s + RECOVERY_S, MOST_CUT_OFF_S)
+
+
+def report(folder: Path, timeline: Timeline, course: Course, code: int | None) -> dict[str, Any]:
     """Returns all figures and checks of a run that is over; `code` is its exit code."""
+    faults = course.faults
     rows = [json.loads(line) for line in _text(folder / "metrics" / "replay.jsonl").splitlines()]
     began_s = timeline.samples[0].unix_s if timeline.samples else 0.0
-    done = [_recovery(fault, timeline) | {"at_s": round(fault.at_unix_s - began_s, 1)} for fault in faults]
+    most_s = cut_off_s(course.period_s)
+    done = [_recovery(fault, timeline, most_s) | {"at_s": round(fault.at_unix_s - began_s, 1)} for fault in faults]
     losses = _losses(folder, rows, faults)
     facts = json.loads(_text(folder / "run.json") or "{}")
-    leftovers = _leftovers(folder)
+    leftovers = leftovers_of(folder)
     resources = _resources(timeline, load_config(folder).replay.capacity)
     final = _evaluation(folder / "evaluation" / "final.json")
     checks = {
         "the run ended as asked": code == 0 and facts.get("outcome") == "completed",
         "every fault was recovered from": all(one["flowing_s"] is not None or one["is_cut_off"] for one in done),
+        "every role worked again before the next fault": not course.stuck,
         "every transition is accounted for": bool(rows) and all(map(_adds_up, rows)),
         "no snapshot lost more than came after it": all(loss["within_bound"] for loss in losses),
-        "no process is left": not _processes_of(folder),
+        "no process is left": not processes_of(folder),
         "no unfinished file or socket is left": not leftovers,
         "memory and open files stay flat": all(one["is_flat"] for one in resources.values()),
     }
@@ -125,6 +145,7 @@ def report(folder: Path, timeline: Timeline, faults: Sequence[Fault], code: int 
         "hits": sum(len(fault.roles) for fault in faults),
         "restarts": sum(row["restarts"] for row in timeline.samples[-1].roles.values()) if timeline.samples else 0,
         "leftovers": leftovers,
+        "stuck": course.stuck,
         "evaluation": final,
         "undisturbed": _evaluation(UNDISTURBED),
     }
@@ -142,7 +163,8 @@ def document(result: dict[str, Any]) -> str:
     lines += [
         "",
         f"- {len(result['faults'])} faults in {result['minutes']:g} minutes, seed {result['seed']}; "
-        f"{result['env_steps']:,} steps, {result['learner_steps']:,} updates, {inserted:,.0f} transitions stored.",
+        f"{_count(result['env_steps'])} steps, {_count(result['learner_steps'])} updates, "
+        f"{_count(inserted)} transitions stored.",
         f"- Processes hit: {result['hits']}; processes started again: {result['restarts']}.",
         f"- Transitions lost with a killed replay server: {', '.join(f'{each:,.0f}' for each in lost) or 'none'}.",
         f"- Children of a killed launcher were gone after {result['launcher_killed']['roles_ended_after_s']:.1f} s.",
@@ -160,7 +182,7 @@ def _is_heard(row: dict[str, Any]) -> bool:
     return row["state"] != "starting" and not row["state"].startswith("waiting to be")
 
 
-def _recovery(fault: Fault, timeline: Timeline) -> dict[str, Any]:
+def _recovery(fault: Fault, timeline: Timeline, most_s: float) -> dict[str, Any]:
     """When each victim was replaced, and when the last of them worked again, in s after the fault."""
     replaced: list[float] = []
     flowing: list[float] = []
@@ -176,7 +198,7 @@ def _recovery(fault: Fault, timeline: Timeline) -> dict[str, Any]:
         "roles": list(fault.roles),
         "replaced_s": round(max(replaced), 2) if len(replaced) == everybody else None,
         "flowing_s": round(max(flowing), 2) if len(flowing) == everybody else None,
-        "is_cut_off": not after or after[-1].unix_s - fault.at_unix_s < CUT_OFF_S,
+        "is_cut_off": not after or after[-1].unix_s - fault.at_unix_s < most_s,
     }
 
 
@@ -256,17 +278,23 @@ def _resources(timeline: Timeline, capacity: int) -> dict[str, Any]:
     return result
 
 
-def _leftovers(folder: Path) -> list[str]:
-    """Files that should not be there: unfinished ones (but recordings, which can be opened) and sockets."""
-    return sorted(
+def leftovers_of(folder: Path, killed_launcher: int | None = None) -> list[str]:
+    """Returns files that should not be there: unfinished ones (but recordings, which can be opened) and sockets.
+
+    A launcher that was killed, given by its pid, could not remove the run's sockets and what it was just writing.
+    """
+    found = sorted(
         str(path.relative_to(folder))
         for path in folder.rglob("*")
         if (path.name.endswith((".part", ".writing")) and path.parent.name != "recordings") or path.is_socket()
     )
+    if killed_launcher is None:
+        return found
+    return [name for name in found if not name.startswith("sockets/") and not name.endswith(f".{killed_launcher}.part")]
 
 
-def _processes_of(folder: Path) -> list[int]:
-    """Processes whose command names the run folder."""
+def processes_of(folder: Path) -> list[int]:
+    """Returns processes whose command names the run folder."""
     return [each.pid for each in psutil.process_iter(["cmdline"]) if str(folder) in (each.info["cmdline"] or [])]
 
 
@@ -279,6 +307,10 @@ def _evaluation(path: Path) -> dict[str, Any] | None:
 
 def _text(path: Path) -> str:
     return path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+
+
+def _count(value: float | None) -> str:
+    return "-" if value is None else f"{value:,.0f}"
 
 
 def _number(value: float | None) -> str:

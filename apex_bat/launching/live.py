@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import math
+from contextlib import suppress
 from types import TracebackType
 from typing import Any, Protocol
 
@@ -19,7 +20,8 @@ from apex_bat.launching.standing import Standing
 from apex_bat.launching.supervisor import Watched
 
 PLAIN_PERIOD_S = 10.0
-DISK_FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
+UNWRITABLE = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EIO}
+"""Errors of writing a line that are not worth a run: the disk is full, or the terminal is gone."""
 WIDE = 120
 """Columns from which the figures stand in five pairs a row instead of three."""
 FIGURES_LINES = 9
@@ -73,7 +75,7 @@ class PlainView:
         try:
             self._console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
         except OSError as error:
-            if error.errno not in DISK_FULL:  # a line in a file on a full disk is not worth a run
+            if error.errno not in UNWRITABLE:
                 raise
 
 
@@ -93,7 +95,8 @@ class TerminalView:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._live.__exit__(kind, error, trace)
+        with suppress(OSError):  # the terminal is gone; how the run ended does not depend on it
+            self._live.__exit__(kind, error, trace)
 
     def show(self, standing: Standing, watched: dict[str, Watched]) -> None:
         """Draws the panels anew."""
@@ -109,7 +112,8 @@ class TerminalView:
             parts.append(Panel(self._curves(width - 4), title="since the start", title_align="left"))
             height -= len(CURVES) + 2
         self.renderable = Group(*parts, _roles(standing, watched, height))
-        self._live.update(self.renderable)
+        with suppress(OSError):
+            self._live.update(self.renderable)
 
     def _curves(self, width: int) -> Table:
         table = Table.grid(padding=(0, 2))

@@ -88,8 +88,10 @@ def train(
             with view:
                 outcome, reason = launch.follow(view)
         finally:
-            launch.end()
+            is_killed = launch.end()
             collector.close()
+        if is_killed and outcome == "completed":  # its last files may be missing, and whoever pressed Ctrl-C wants out
+            outcome, reason = "interrupted", "interrupted while it ended"
         return Ended(outcome, reason, *launch.counters())
 
 
@@ -128,14 +130,16 @@ class _Launch:
         """Returns environment steps, updates and elapsed seconds of the whole run."""
         return int(self._standing.env_steps), int(self._standing.learner_step), self._standing.elapsed_s
 
-    def end(self) -> None:
-        """Stops the roles, the replay last, and kills what outlives its grace."""
+    def end(self) -> bool:
+        """Stops the roles, the replay last, and kills what outlives its grace; returns whether Ctrl-C cut it short."""
+        is_cut = False
         try:
             names = list(self._supervisor.watched)
             self._end([name for name in names if name != "replay"], self._config.launch.grace_s)
             self._end(["replay"], self._config.launch.grace_s)
         except KeyboardInterrupt:
-            _log.warning("interrupted again: killing the roles")
+            is_cut = True
+            _log.warning("interrupted while the roles end: killing them")
         finally:
             for watched in self._supervisor.watched.values():
                 if watched.handle is not None:
@@ -149,6 +153,7 @@ class _Launch:
                 self._write_status()
             if self._metrics is not None:
                 self._metrics.close()
+        return is_cut
 
     def _start(self, role: Role, incarnation: int) -> RoleProcess:
         threads = self._config.train.threads if role.kind == "learner" else 1
@@ -230,6 +235,15 @@ class _Launch:
             _log.warning("%s: did not end within %g s; killed", watched.role.name, grace_s)
 
 
+def heeded(*names: str) -> list[signal.Signals]:
+    """Returns those of some signals that this system has and that this process was not told to ignore.
+
+    What `nohup` or a shell's background sets to be ignored stays ignored.
+    """
+    numbers: list[signal.Signals] = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    return [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
+
+
 @contextmanager
 def _terminable() -> Iterator[None]:
     """Makes SIGTERM and a closed terminal end a run in the same way as Ctrl-C."""
@@ -237,7 +251,7 @@ def _terminable() -> Iterator[None]:
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = heeded("SIGTERM", "SIGHUP")
     former = {number: signal.signal(number, interrupt) for number in numbers}
     try:
         yield

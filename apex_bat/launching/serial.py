@@ -20,7 +20,7 @@ from msgspec import structs
 
 from apex_bat.config import Config, ConfigError
 from apex_bat.launching.live import View
-from apex_bat.launching.local import Ended, Outcome
+from apex_bat.launching.local import Ended, Outcome, heeded
 from apex_bat.launching.serial_reports import SerialReports
 from apex_bat.launching.serial_state import SavedRun, put_back, read_newest, write
 from apex_bat.launching.standing import Origin
@@ -28,6 +28,7 @@ from apex_bat.replay.store import ReplayStore
 from apex_bat.roles.actor import Actor
 from apex_bat.roles.evaluator import Evaluator
 from apex_bat.roles.learner import Learner, new_agent
+from apex_bat.roles.logs import launcher_log
 from apex_bat.roles.plan import Addresses, Assignment, Role
 from apex_bat.roles.reporting import RoleReporter
 from apex_bat.roles.serial import BoardReader, StoreSink, StoreSource, WeightsBoard
@@ -50,7 +51,7 @@ def train(config: Config, run: Path, view: View, *, is_resumed: bool = False) ->
         StorageError: there is no sound state to go on from, or the disk is full.
     """
     stop = threading.Event()
-    with _stopping(stop), ExitStack() as stack:
+    with _stopping(stop), launcher_log(run, config.launch), ExitStack() as stack:
         serial = SerialRun(settings_of(config), run, stop, stack, is_resumed=is_resumed)
         stack.enter_context(view)
         return serial.follow(view)
@@ -240,7 +241,7 @@ def _stopping(stop: threading.Event) -> Iterator[None]:
             raise KeyboardInterrupt
         stop.set()
 
-    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = heeded("SIGINT", "SIGTERM", "SIGHUP")
     former = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield

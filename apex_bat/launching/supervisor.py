@@ -2,7 +2,8 @@
 
 A role that ends unasked is started again after a backoff that doubles with each quick failure; one that stays silent
 is killed first. A role that fails too often in a row, or says that trying again is useless, ends the run. While the
-machine cannot start a process, the role is tried again for as long as it takes.
+machine cannot start a process, the role is tried again for as long as it takes. Time in which the launcher itself did
+not look, because it was stopped or the machine slept, is no silence of the roles.
 """
 
 from __future__ import annotations
@@ -18,6 +19,10 @@ from apex_bat.roles.plan import Role
 USELESS = 2
 """Exit code by which a role says that starting it again would fail in the same way."""
 MAX_BACKOFF_S = 30.0
+MOST_DOUBLINGS = 64
+"""How often the backoff doubles at most: beyond any that is allowed, and far below what a float holds."""
+LATE_LOOK_S = 2.0
+"""What counts of the time between two looks at most, in s; what is longer was the launcher's own silence."""
 TEMPORARY = {
     getattr(errno, name, None) for name in ("EAGAIN", "ENOMEM", "EMFILE", "ENFILE", "ENOSPC", "EDQUOT", "EINTR")
 }
@@ -63,6 +68,11 @@ class Watched:
         self.handle: Handle | None = None
         self.restarts = 0
         self.failures_in_a_row = 0
+        """Quick failures, and starts without a report, since it last worked for a while."""
+        self.failed_starts = 0
+        """How often in a row the machine could not start it."""
+        self.was_mute = False
+        """Whether the present process was killed because it was never heard."""
         self.started_s = 0.0
         self.heard_s: float | None = None
         """When this process was heard last; None before its first report."""
@@ -81,9 +91,11 @@ class Supervisor:
         self.watched = {role.name: Watched(role) for role in roles}
         self._start = start
         self._launch = launch
+        self._looked_s = 0.0
 
     def start(self, now_s: float) -> None:
         """Starts every role."""
+        self._looked_s = now_s
         for watched in self.watched.values():
             self._begin(watched, now_s)
 
@@ -99,7 +111,11 @@ class Supervisor:
         Raises:
             RoleFailedError: a role is beyond its budget.
         """
+        missed_s = now_s - self._looked_s - LATE_LOOK_S
+        self._looked_s = now_s
         for watched in self.watched.values():
+            if missed_s > 0.0:
+                _forgive(watched, missed_s, now_s)
             if watched.handle is not None:
                 self._check(watched, watched.handle, now_s)
             elif watched.due_s is not None and now_s >= watched.due_s:
@@ -121,8 +137,10 @@ class Supervisor:
 
     def _begin(self, watched: Watched, now_s: float) -> None:
         watched.started_s, watched.heard_s, watched.due_s, watched.reason = now_s, None, None, ""
+        watched.was_mute = False
         try:
             watched.handle = self._start(watched.role, watched.restarts)
+            watched.failed_starts = 0
         except OSError as error:
             if error.errno not in TEMPORARY:
                 raise RoleFailedError(f"{watched.role.name}: cannot be started: {error.strerror or error}") from error
@@ -144,14 +162,20 @@ class Supervisor:
         if silent_s > (self._launch.start_timeout_s if is_new else self._launch.heartbeat_timeout_s):
             what = "not heard since its start" if is_new else "silent"
             _log.warning("%s: %s for %.0f s; killed and replaced", watched.role.name, what, silent_s)
+            watched.was_mute = watched.was_mute or is_new
             watched.heard_s = now_s  # a process that cannot even be killed is not tried again at each look
             handle.kill()
 
     def _fail(self, watched: Watched, ended: Exit, now_s: float) -> None:
-        is_quick = now_s - watched.started_s < self._launch.quick_failure_s
-        watched.failures_in_a_row = watched.failures_in_a_row + 1 if is_quick else 1
-        self._judge(watched, ended)
-        wait_s = min(self._launch.backoff_s * 2.0 ** (watched.failures_in_a_row - 1), MAX_BACKOFF_S)
+        if ended.code is None:
+            watched.failed_starts += 1
+            doublings = watched.failed_starts - 1
+        else:
+            is_quick = watched.was_mute or now_s - watched.started_s < self._launch.quick_failure_s
+            watched.failures_in_a_row = watched.failures_in_a_row + 1 if is_quick else 1
+            self._judge(watched, ended)
+            doublings = watched.failures_in_a_row - 1
+        wait_s = min(self._launch.backoff_s * 2.0 ** min(doublings, MOST_DOUBLINGS), MAX_BACKOFF_S)
         watched.due_s, watched.reason = now_s + wait_s, describe(ended)
         _log.warning("%s: %s; starts again in %.1f s", watched.role.name, describe(ended), wait_s)
 
@@ -159,10 +183,17 @@ class Supervisor:
         name = watched.role.name
         if ended.code == USELESS:
             raise RoleFailedError(ended.detail or f"{name} cannot work with these settings")
-        if watched.failures_in_a_row > self._launch.max_failures and ended.code is not None:
+        if watched.failures_in_a_row > self._launch.max_failures:
             raise RoleFailedError(
                 f"{name}: given up after {watched.failures_in_a_row} quick failures, the last: {describe(ended)}"
             )
+
+
+def _forgive(watched: Watched, missed_s: float, now_s: float) -> None:
+    """Moves the times of a role by what the launcher missed; what it has just heard stays heard now."""
+    watched.started_s = min(watched.started_s + missed_s, now_s)
+    if watched.heard_s is not None:
+        watched.heard_s = min(watched.heard_s + missed_s, now_s)
 
 
 def describe(ended: Exit) -> str:

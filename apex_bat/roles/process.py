@@ -14,6 +14,7 @@ from pathlib import Path
 from types import FrameType
 
 from apex_bat.config import Config, ConfigError, load
+from apex_bat.replay.snapshot import SnapshotError
 from apex_bat.roles.logs import RotatingLog
 from apex_bat.roles.plan import Assignment, Kind, Role, read_addresses
 from apex_bat.storage import StorageError
@@ -45,8 +46,8 @@ def run_process(kind: Kind, number: int, run: Path, incarnation: int, leashed: b
     faulthandler.enable()
     role = Role(kind, number)
     logging.basicConfig(level=logging.INFO, format=_line_format(role))
-    stop, was_terminated = threading.Event(), threading.Event()
-    _hear_sigterm(stop, was_terminated)
+    stop = threading.Event()
+    heard = _hear_signals(stop)
     try:
         config = load(run / "config.toml")
         addresses = read_addresses(run / ADDRESSES)
@@ -56,13 +57,13 @@ def run_process(kind: Kind, number: int, run: Path, incarnation: int, leashed: b
         _run(Assignment(role, config, run, addresses, stop, incarnation, flown_steps))
     except KeyboardInterrupt:
         return INTERRUPTED
-    except (ConfigError, TransportError, StorageError) as error:
+    except (ConfigError, TransportError, StorageError, SnapshotError) as error:
         _log.error("%s", str(error).replace("\n", " "))  # one line, for a person
         return USELESS
     except Exception:
         _log.exception("failed")
         return FAILED
-    return TERMINATED if was_terminated.is_set() else 0
+    return heard[0] if heard else 0
 
 
 def hold_leash(stop: threading.Event, grace_s: float) -> None:
@@ -88,12 +89,23 @@ def _be_continued_when_orphaned() -> None:
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)
 
 
-def _hear_sigterm(stop: threading.Event, was_terminated: threading.Event) -> None:
-    def terminate(_number: int, _frame: FrameType | None) -> None:
-        was_terminated.set()
-        stop.set()
+def _hear_signals(stop: threading.Event) -> list[int]:
+    """Makes Ctrl-C and SIGTERM ask the role to stop, so that it saves; a second Ctrl-C breaks that off.
 
-    signal.signal(signal.SIGTERM, terminate)
+    Returns:
+        The exit codes of what was heard, in order; it grows.
+    """
+    heard: list[int] = []
+
+    def end(number: int, _frame: FrameType | None) -> None:
+        stop.set()
+        heard.append(INTERRUPTED if number == signal.SIGINT else TERMINATED)
+        if number == signal.SIGINT and len(heard) > 1:
+            raise KeyboardInterrupt
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, end)
+    return heard
 
 
 def _write_log(role: Role, run: Path, config: Config) -> None:

@@ -1,5 +1,6 @@
 """The live view fits its terminal."""
 
+import errno
 import io
 from contextlib import suppress
 from pathlib import Path
@@ -69,6 +70,47 @@ def test_a_standstill_is_shown_and_fits(width: int) -> None:
     plain = io.StringIO()
     PlainView(Console(file=plain)).show(standing, watched)
     assert "learner: waiting to be started" in plain.getvalue()
+
+
+class Gone(io.StringIO):
+    """A terminal that is closed meanwhile."""
+
+    is_closed = False
+
+    def write(self, text: str) -> int:
+        if self.is_closed:
+            raise OSError(errno.EIO, "Input/output error")
+        return super().write(text)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # of the thread that redraws
+@pytest.mark.parametrize("is_interrupted", [False, True])
+def test_a_terminal_that_is_closed_does_not_change_how_the_run_ends(is_interrupted: bool) -> None:
+    config, file = load(None, []), Gone()
+    standing, watched = Standing(config, now_s=0.0), {role.name: Watched(role) for role in roles_of(config)}
+    view, end = TerminalView(Console(force_terminal=True, file=file), "apex-bat train"), ""
+    try:
+        with view:
+            view.show(standing, watched)
+            file.is_closed = True
+            view.show(standing, watched)
+            if is_interrupted:
+                raise KeyboardInterrupt  # as SIGHUP does
+            end = "completed"
+    except KeyboardInterrupt:
+        end = "interrupted"
+    except OSError:
+        end = "failed"
+    assert end == ("interrupted" if is_interrupted else "completed")
+
+
+def test_plain_lines_to_a_terminal_that_is_closed_do_not_end_the_run() -> None:
+    file, is_through = Gone(), False
+    file.is_closed = True
+    with suppress(OSError):
+        PlainView(Console(file=file)).show(Standing(load(None, []), now_s=0.0), {})
+        is_through = True
+    assert is_through
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")

@@ -12,6 +12,9 @@ from typing import Any
 
 import pytest
 
+from apex_bat.config import Config
+from apex_bat.evaluation import runs
+from apex_bat.launching import local
 from apex_bat.replay.metrics import declared_name
 from apex_bat.roles.metrics import DECLARED
 
@@ -183,3 +186,24 @@ def test_a_port_in_use_is_named_and_nothing_is_left_running(tmp_path: Path) -> N
     assert "the port is in use" in output
     assert "Traceback" not in output
     assert not any(is_alive(row["pid"]) for row in status(tmp_path / "run").values() if row["pid"])
+
+
+@pytest.mark.parametrize(("is_pressed", "outcome"), [(False, "completed"), (True, "interrupted")])
+def test_ctrl_c_while_the_roles_of_a_complete_run_end_is_heard(
+    is_pressed: bool, outcome: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> list[object]:
+        if is_pressed:
+            raise KeyboardInterrupt
+        return []
+
+    class Blind:
+        def show(self, *_: object) -> None: ...
+        def __enter__(self) -> None: ...
+        def __exit__(self, *_: object) -> None: ...
+
+    monkeypatch.setattr(local._Launch, "follow", lambda *_: ("completed", ""))
+    monkeypatch.setattr(local.Supervisor, "stop", stop)
+    run = tmp_path / "run"
+    runs.create(run, Config())
+    assert local.train(Config(), run, Blind()).outcome == outcome  # type: ignore[arg-type]

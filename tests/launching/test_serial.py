@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+import signal
 import threading
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,7 +13,7 @@ from types import TracebackType
 import pytest
 
 from apex_bat.config import Config, ConfigError, load
-from apex_bat.launching import serial, serial_state
+from apex_bat.launching import local, serial, serial_state
 from apex_bat.launching.local import Ended
 from apex_bat.launching.standing import Standing
 from apex_bat.launching.supervisor import Watched
@@ -48,9 +50,39 @@ def config(*changes: str) -> Config:
 
 
 def folder(path: Path) -> Path:
-    for name in ("metrics", "checkpoints", "recordings"):
+    for name in ("metrics", "checkpoints", "recordings", "logs"):
         (path / name).mkdir(parents=True)
     return path
+
+
+def test_what_a_serial_run_says_is_in_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial, "SerialRun", Wordy)
+    assert train(tmp_path / "run").outcome == "completed"
+    assert "the state was not saved" in (tmp_path / "run" / "logs" / "launcher.log").read_text()
+
+
+class Wordy:
+    """A run that is over at once, and has something to say."""
+
+    def __init__(self, *_: object, is_resumed: bool) -> None:
+        del is_resumed
+
+    def follow(self, _view: NoView) -> Ended:
+        logging.getLogger(serial.__name__).error("the state was not saved")
+        return Ended("completed", "", 0, 0, 0.0)
+
+
+@pytest.mark.parametrize("is_serial", [True, False])
+@pytest.mark.parametrize("is_ignored", [True, False])
+def test_a_closed_terminal_ends_a_run_unless_nohup_said_to_ignore_it(is_ignored: bool, is_serial: bool) -> None:
+    if not hasattr(signal, "SIGHUP"):
+        pytest.skip("this system has no SIGHUP")
+    former = signal.signal(signal.SIGHUP, signal.SIG_IGN if is_ignored else signal.SIG_DFL)
+    try:
+        with serial._stopping(threading.Event()) if is_serial else local._terminable():
+            assert (signal.getsignal(signal.SIGHUP) == signal.SIG_IGN) is is_ignored
+    finally:
+        signal.signal(signal.SIGHUP, former)
 
 
 def train(run: Path, *changes: str, resume: bool = False) -> Ended:

@@ -51,7 +51,9 @@ def restarted(launch: Launch, _: Path) -> object:
     supervisor.start(now_s)
     try:
         for _attempt in range(12):
-            now_s += 15.0
+            for _look in range(15):
+                now_s += 1.0
+                supervisor.watch(now_s)
             handles[-1].ended.set()
             supervisor.watch(now_s)
             now_s = supervisor.watched["actor-0"].due_s or now_s

@@ -101,12 +101,13 @@ def serves(run: Path) -> bool:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_a_role_that_somebody_else_ends_says_so(run: Path, number: signal.Signals, code: int) -> None:
+def test_a_role_that_somebody_else_ends_saves_and_says_so(run: Path, number: signal.Signals, code: int) -> None:
     process = RoleProcess(Role("replay", 0), run, 0, 1)
     try:
         eventually(lambda: serves(run), 30.0, "it serves")
         os.kill(process.pid, number)
         assert ended(process) == code
+        assert (run / "replay" / "replay.snapshot").exists()
     finally:
         process.kill()
 
@@ -144,6 +145,15 @@ def test_settings_that_a_role_cannot_use_are_the_line_that_a_person_reads(run: P
     result = process.poll()
     assert result is not None
     assert "nonsense: no such setting" in result.detail
+
+
+def test_a_torn_snapshot_is_the_line_that_a_person_reads_and_no_reason_to_try_again(run: Path) -> None:
+    (run / "replay" / "replay.snapshot").write_bytes(b"torn")
+    process = RoleProcess(Role("replay", 0), run, 0, 1)
+    assert ended(process) == 2
+    result = process.poll()
+    assert result is not None
+    assert "not a snapshot of the replay" in result.detail
 
 
 def test_what_a_killed_process_was_writing_is_removed_and_nothing_else(run: Path) -> None:

@@ -6,6 +6,7 @@ Run it with `apex-bat bench wire` or `python -m benchmarks.wire`.
 from __future__ import annotations
 
 import json
+import logging
 import multiprocessing
 import tempfile
 import time
@@ -41,6 +42,7 @@ _processes = multiprocessing.get_context("spawn")
 
 def measure() -> list[Record]:
     """Returns the records that `apex-bat bench wire` writes."""
+    _leave_out_warnings()
     with tempfile.TemporaryDirectory() as folder:
         keys = make_keys(Path(folder) / "keys")
         records: list[Record] = []
@@ -59,6 +61,11 @@ def measure() -> list[Record]:
         return records
 
 
+def _leave_out_warnings() -> None:
+    """Leaves out that others of this machine can connect: it is measured on loopback, for some seconds."""
+    logging.getLogger("apex_bat.transport.sockets").setLevel(logging.ERROR)
+
+
 def _settings(capacity: int, batch_size: int) -> Config:
     replay = Replay(capacity=capacity, never_block=True, snapshot_period_s=0.0)
     return msgspec.structs.replace(Config(), replay=replay, learner=Learner(batch_size=batch_size))
@@ -73,6 +80,7 @@ def _serve(
     batch_size: int,
 ) -> None:
     """A process: serves until told to stop, and gives its rates since it was told to begin measuring."""
+    _leave_out_warnings()
     server = ReplayServer(_settings(CAPACITY, batch_size), "tcp://127.0.0.1:0", np.random.default_rng(0), keys=keys)
     addresses.put(server.address)
     begun_s, first = time.monotonic(), server.metrics()

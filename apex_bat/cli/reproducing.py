@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from apex_bat.cli.training import ConfigFile, Overrides, check
+from apex_bat.cli.training import ConfigFile, Overrides, check, follow, locked_run
 from apex_bat.config import Config, ConfigError, load
 
 if TYPE_CHECKING:  # `--help` needs none of it
@@ -19,8 +18,6 @@ if TYPE_CHECKING:  # `--help` needs none of it
 
 DEFAULT_BUDGET = 180_000
 """Environment steps of a training: what `apex-bat train --config configs/memory.toml` does in its 11 minutes."""
-ROLES_END_S = 3.0
-"""Beyond their grace, until the roles of a killed launcher are gone."""
 
 
 def reproduce(
@@ -66,6 +63,7 @@ def reproduce(
         protocol = _protocol(arenas, load_config(folders[0]))
         baselines = into / "baselines"
     else:
+        reproduction.refuse_limits(overrides or ())
         config = load(config_file, overrides or ())
         protocol = _protocol(arenas, config)
         planned = reproduction.plan(folder, config, _split(conditions), seeds, budget)
@@ -93,8 +91,8 @@ def _protocol(arenas: str, config: Config) -> Protocol:
     from apex_bat.simulation.arenas import load_arenas
 
     names = _split(arenas)
-    if not names:
-        raise ConfigError("--arenas: name at least one arena")
+    if not names or len(set(names)) < len(names):
+        raise ConfigError("--arenas: name at least one arena, and each once")
     for name in names:
         if len(load_arenas(name)) > 1:
             raise ConfigError(f"--arenas {name}: one arena at a time; name each")
@@ -105,30 +103,17 @@ def _train(each: Planned, title: str, console: Console, *, plain: bool) -> bool:
     """Makes one training of a campaign; returns False when it was interrupted, and exits when it failed."""
     from apex_bat.evaluation import reproduction, runs
     from apex_bat.launching import local
-    from apex_bat.launching.live import PlainView, view_for
-    from apex_bat.launching.lock import locked
-    from apex_bat.launching.status import is_launched
-    from apex_bat.storage import StorageError
 
     title = f"apex-bat reproduce: {title}"
     console.print(title, highlight=False, soft_wrap=True)
     each.folder.mkdir(parents=True, exist_ok=True)
-    patience_s = each.config.launch.grace_s + ROLES_END_S
-    with locked(each.folder, lambda: is_launched(each.folder), patience_s) as lock:
+    with locked_run(each.folder, each.config) as lock:
+        if each.standing == "trained":  # by another process, which held the lock until now
+            return True
         reproduction.clear(each.folder)
         runs.create(each.folder, each.config)
-        view = PlainView(console) if plain else view_for(console, title)
-        try:
-            ended = local.train(each.config, each.folder, view, lock=lock)
-        except BaseException as error:
-            with suppress(StorageError):
-                runs.finish(each.folder, "failed", reason=str(error) or type(error).__name__)
-            raise
-    runs.finish(
-        each.folder, ended.outcome, reason=ended.reason, env_steps=ended.env_steps, learner_steps=ended.learner_steps,
-        elapsed_s=round(ended.elapsed_s, 3),
-    )  # fmt: skip
-    if ended.outcome == "failed":
-        typer.echo(f"apex-bat: {ended.reason}; the logs are in {each.folder / 'logs'}", err=True)
-        raise typer.Exit(1)
+        ended = follow(
+            lambda view: local.train(each.config, each.folder, view, lock=lock),
+            each.folder, title, console, plain=plain,
+        )  # fmt: skip
     return ended.outcome == "completed"

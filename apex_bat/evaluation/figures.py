@@ -39,7 +39,7 @@ VIOLIN_TOP_M = 1.4
 
 
 def learning_curves(groups: Sequence[Group]) -> Figure:
-    """Fig. 4.1: how the judged checkpoints fared over the environment steps; thin lines are seeds, bands 95 %."""
+    """Fig. 4.1: how the judged checkpoints fared over the environment steps; thin lines are runs, bands 95 %."""
     figure = new_figure(9.0, 3.4)
     left, right = figure.subplots(1, 2)
     looks = looks_of([each.label for each in groups])
@@ -119,12 +119,10 @@ def _draw_curves(axes: Axes, rows: Sequence[tuple[Floats, Floats]], label: str, 
     for steps, values in rows:
         axes.plot(steps, values, ".", color=look.colour, linestyle=look.dashes, linewidth=0.6, markersize=4, alpha=0.6)
     if len(rows) == 1:
-        axes.lines[-1].set(linewidth=2.0, alpha=1.0, markersize=7, label=f"{label}, 1 seed")
+        axes.lines[-1].set(linewidth=2.0, alpha=1.0, markersize=7, label=f"{label}, 1 run")
         return
     grid, middle, band = mean_curve(rows)
-    axes.plot(
-        grid, middle, color=look.colour, linestyle=look.dashes, linewidth=2.0, label=f"{label}, {len(rows)} seeds"
-    )
+    axes.plot(grid, middle, color=look.colour, linestyle=look.dashes, linewidth=2.0, label=f"{label}, {len(rows)} runs")
     if band is not None:
         axes.fill_between(grid, *band, color=look.colour, alpha=0.18, linewidth=0.0)
 

@@ -16,12 +16,12 @@ INFERRED = (
 )
 CAPTIONS = {
     "learning_curves": "Fig. 4.1. Greedy flights of the checkpoints judged during training, in the training arena. "
-    "Dots and thin lines are seeds, thick lines their mean; bands are 95 % intervals over seeds, drawn from 3 on.",
+    "Dots and thin lines are runs, thick lines their mean; bands are 95 % intervals over runs, drawn from 3 on.",
     "trajectories": "Fig. 4.2. All flights of the first seed of each condition. Circles are starts, stars collisions. "
     + INFERRED,
     "behaviour": "Fig. 4.3. Above: distance to the nearest wall at each step of all flights (bar: middle half, dot: "
     "median, dotted: 0.4 m, below which a step is damage). Middle: share of actions. Below: distance flown, mean and "
-    "standard error over flights, as in the thesis; dots are the means of seeds. Greys are baselines.",
+    "standard error over flights, as in the thesis; dots are the means of runs. Greys are baselines.",
     "point_cloud": "Fig. 3.4. What the 3D range sensor meets at {where}; the echo is made from these points.",
     "directivity": "Fig. 3.5. Directivity of mouth and ears together, at the call's frequency.",
     "echo_chain": "Fig. 3.6. The echo at {where}, stage by stage: impulses, sound, cochlea, frame.",

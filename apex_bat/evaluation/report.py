@@ -6,18 +6,13 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from apex_bat.evaluation.claims import RULES, WEAK_MARK, Finding, completed, findings, shown, shown_p
+from apex_bat.evaluation.claims import ALIKE_MARK, RULES, WEAK_MARK, Finding, completed, findings, shown, shown_p
 from apex_bat.evaluation.document import Block, Bullets, Heading, Paragraph, Picture, to_html, to_markdown
-from apex_bat.evaluation.groups import CONDITIONS, Group, group, thesis_groups
-from apex_bat.evaluation.plates import INFERRED, draw_plates
+from apex_bat.evaluation.groups import Group, group, long_labels, thesis_groups
+from apex_bat.evaluation.method import method
+from apex_bat.evaluation.plates import draw_plates
 from apex_bat.evaluation.results import Judged, Protocol
-from apex_bat.evaluation.statistics import (
-    ENOUGH_SEEDS,
-    NUM_RESAMPLES,
-    bootstrap,
-    least_p,
-    mean,
-)
+from apex_bat.evaluation.statistics import ENOUGH_SEEDS, bootstrap_share, least_p
 from apex_bat.evaluation.tables import (
     Comparison,
     arena_table,
@@ -89,27 +84,33 @@ def answer(
         )
     sentences.append(f"Seeds: {', '.join(f'{each.label} {each.num_seeds}' for each in trained)}.")
     shares = [
-        f"{each.label} {shown(bootstrap(mean, [each.scores(protocol.arenas, completed)]), 100.0, ' %')}"
+        f"{each.label} {shown(bootstrap_share(each.scores(protocol.arenas, completed)), 100.0, ' %')}"
         for each in groups
     ]
     sentences.append(f"Flights completed in {', '.join(protocol.arenas)} together: {'; '.join(shares)}.")
     sentences += _compared(comparisons, trained)
     text = " ".join(sentences)
-    return f"{text} {WEAK_MARK} An interval from fewer than {ENOUGH_SEEDS} seeds." if WEAK_MARK in text else text
+    notes = {
+        WEAK_MARK: f"An interval from fewer than {ENOUGH_SEEDS} seeds.",
+        ALIKE_MARK: "No resample differs: a share whose flights all ended alike has Wilson's interval, as if flights "
+        "were independent; any other number none that tells how sure it is.",
+    }
+    return " ".join([text, *(f"{mark} {note}" for mark, note in notes.items() if mark in text)])
 
 
 def _compared(comparisons: Sequence[Comparison], trained: Sequence[Group]) -> list[str]:
-    """Sentences on the pairs of the thesis's conditions, by completed flights."""
+    """Sentences on the pairs of conditions that are held against the thesis, by completed flights."""
+    judged = {each.label for each in thesis_groups(trained).values()}
     seeds = {each.label: each.num_seeds for each in trained}
     sentences = []
     for each in comparisons:
-        if each.what != "flights completed" or not {each.first, each.second} <= set(CONDITIONS):
+        if each.what != "flights completed" or not {each.first, each.second} <= judged:
             continue
         text = f"{each.first} less {each.second}: {shown(each.difference, 100.0, ' points')}"
         if each.corrected_p == each.corrected_p:  # not NaN
             least = least_p(seeds[each.first], seeds[each.second])
             text += f", p = {shown_p(each.corrected_p)} (Holm; one test alone can reach {shown_p(least)} at best)"
-        sentences.append(text + ".")
+        sentences.append(f"{text} ({each.remark})." if each.remark else f"{text}.")
     return sentences
 
 
@@ -135,40 +136,10 @@ def _blocks(
         Heading("Figures"),
         *pictures,
         Heading("Method"),
-        *_method(groups, protocol),
-        Heading("The runs"),
-        runs_table(groups),
-    ]
-
-
-def _method(groups: Sequence[Group], protocol: Protocol) -> list[Block]:
-    config = next(each for each in groups if each.is_trained).runs[0].config
-    few = [each.label for each in groups if each.is_trained and each.num_seeds < ENOUGH_SEEDS]
-    marked = f" Here that is so for {', '.join(few)}." if few else ""
-    return [
-        Paragraph(
-            "Mohan & Vanderelst (2020), Training an artificial bat: modeling sonar-based obstacle avoidance using deep "
-            f"reinforcement learning. {INFERRED}"
-        ),
-        Paragraph(
-            f"Each policy was trained in {config.arena}. The checkpoint that flew best there during training, from "
-            f"other starts, was flown greedily {protocol.num_flights} times in each of {', '.join(protocol.arenas)}, "
-            f"from the same random safe poses (seed {protocol.start_seed}) for every condition, seed and baseline, "
-            f"until {config.episode.evaluation_steps} steps or contact with a wall. Echoes were rendered by "
-            f"{config.sonar.rendering}."
-        ),
-        Paragraph(
-            "The unit is the seed: flights of one policy are no independent evidence on its training. Intervals are "
-            f"95 % percentiles of {NUM_RESAMPLES} hierarchical bootstrap resamples, which draw seeds within each "
-            "condition and flights within each seed and arena. With one seed no interval is given; with fewer than "
-            f"{ENOUGH_SEEDS} it is marked {WEAK_MARK}.{marked} Interquartile mean and probability of improvement are "
-            "those of Agarwal et al. (2021)."
-        ),
-        Paragraph(
-            "Baselines: random actions; straight on; ild turns away from the ear that hears more of the near echoes "
-            "(Mansour et al. 2019); oracle plans on the range sensor, which no bat here perceives, and shows what the "
-            "arenas allow."
-        ),
+        *method(groups, protocol),
         Heading("Rules of the verdicts", 3),
         Bullets(RULES),
+        Heading("The runs"),
+        runs_table(groups),
+        *(Paragraph(f"{label} differs from the default in {words}.") for label, words in long_labels(groups).items()),
     ]

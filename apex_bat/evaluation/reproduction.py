@@ -12,13 +12,15 @@ import json
 import shutil
 from collections.abc import Callable, Sequence
 from datetime import datetime
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
 
-from apex_bat.config import Config, ConfigError, dumps
+from apex_bat.config import Config, ConfigError
+from apex_bat.config.loading import differences
 from apex_bat.config.settings import Train
 from apex_bat.evaluation import runs
 from apex_bat.evaluation.groups import CONDITIONS
@@ -26,6 +28,11 @@ from apex_bat.evaluation.results import Judged, Protocol, judge, judge_baselines
 from apex_bat.storage import StorageError, read_json, write_text
 
 CAMPAIGN = "campaign.json"
+MAY_DIFFER = (
+    "seed", "condition", "device", "launch.*", "recording.*", "transport.*", "train.threads",
+    "replay.snapshot_period_s",
+)  # fmt: skip
+"""Settings that may change when a campaign goes on: they make its runs no less comparable."""
 
 Standing = Literal["absent", "cut", "trained"]
 Say = Callable[[str], None]
@@ -80,6 +87,17 @@ def plan(folder: Path, config: Config, conditions: Sequence[str], num_seeds: int
     return planned
 
 
+def refuse_limits(overrides: Sequence[str]) -> None:
+    """Refuses limits of a training, which the budget of the campaign would replace without a word.
+
+    Raises:
+        ConfigError: an override sets one.
+    """
+    for override in overrides:
+        if override.partition("=")[0].strip() in ("train.max_minutes", "train.max_env_steps", "train.max_updates"):
+            raise ConfigError(f"--set {override}: trainings of a campaign end by --budget alone, in environment steps")
+
+
 def begin(folder: Path, planned: Sequence[Planned]) -> None:
     """Makes the folder of a campaign, or checks that it is one of the same settings.
 
@@ -89,19 +107,35 @@ def begin(folder: Path, planned: Sequence[Planned]) -> None:
         ConfigError: the folder holds a campaign of other settings.
         RunError: the folder cannot be written, or holds something else.
     """
-    alike = msgspec.structs.replace(planned[0].config, seed=0, condition="memory")
-    path, text = folder / CAMPAIGN, dumps(alike)
+    path = folder / CAMPAIGN
     try:
         if path.exists():
-            if read_json(path).get("settings") != text:
-                raise ConfigError(f"{folder}: holds a campaign of other settings; name another folder with --folder")
+            _compare(folder, read_json(path).get("settings"), planned[0].config)
             return
         if folder.exists() and any(folder.iterdir()):
             raise runs.RunError(f"{folder}: holds something that is no campaign; name another folder with --folder")
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(path, json.dumps({"settings": text}, indent=1) + "\n")
+        write_text(path, json.dumps({"settings": msgspec.to_builtins(planned[0].config)}, indent=1) + "\n")
     except (OSError, StorageError) as error:
         raise runs.RunError(f"{folder}: the folder of the campaign cannot be used: {error}") from None
+
+
+def _compare(folder: Path, settings: object, config: Config) -> None:
+    """Refuses settings other than those that a campaign began with; settings that are newer had their defaults."""
+    try:
+        begun = msgspec.convert(settings, Config)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{folder}: its settings are none of this version ({error}); name another folder") from None
+    apart = [
+        line
+        for line in differences(begun, config)
+        if not any(fnmatch(line.partition(":")[0], pattern) for pattern in MAY_DIFFER)
+    ]
+    if apart:
+        raise ConfigError(
+            f"{folder}: holds a campaign of other settings (begun | asked for: {'; '.join(apart)}); name another "
+            "folder with --folder"
+        )
 
 
 def train_all(planned: Sequence[Planned], train: Callable[[Planned, str], bool], say: Say) -> bool:
@@ -143,14 +177,18 @@ def judge_all(
     """Flies what was trained, and the baselines, as far as that was not done before, and returns both.
 
     Args:
-        folders: of the runs; at least one. The baselines fly with the settings of the first.
+        folders: of the runs; at least one, and each once. The baselines fly with body, rays and ear of the first.
         baselines: folder for the flights of the baselines.
         protocol: how all fly.
         say: tells a line.
 
     Raises:
-        RunError, StorageError: something cannot be read or written.
+        RunError, StorageError: a run is given twice, or something cannot be read or written.
     """
+    resolved = [folder.resolve() for folder in folders]
+    twice = [str(folder) for number, folder in enumerate(folders) if resolved[number] in resolved[:number]]
+    if twice:
+        raise runs.RunError(f"{', '.join(twice)}: given twice, and one run is one piece of evidence")
     judged = []
     for number, folder in enumerate(folders, 1):
         say(f"flying {folder.name}, {number} of {len(folders)}, {protocol.num_flights} times in each arena")

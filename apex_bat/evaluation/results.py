@@ -28,6 +28,9 @@ ARENAS = ("simple", "narrow", "circle")
 """Where the thesis evaluates. That these shipped arenas are its arenas is inferred."""
 NAME = "reproduction"
 """Stem of the files that an evaluation for a report leaves."""
+FLIGHTS_VERSION = 1
+"""Of the code that flies. Raise it when the same policy would fly another way: motion, rays, ear, arenas, starts, the
+ILD pilot or the oracle. Flights that were kept under another number are flown anew."""
 
 
 class Protocol(NamedTuple):
@@ -75,6 +78,11 @@ class Judged:
     """Of the training: seed, commit, host, times, size; empty of a baseline."""
     curve: Curve | None = None
 
+    @property
+    def num_judged(self) -> int:
+        """Checkpoints that flew during the training; 0 of a baseline."""
+        return 0 if self.curve is None else len(self.curve.env_steps)
+
     def of_arena(self, arena: str) -> list[tuple[FlightRecord, Trace]]:
         """Returns the flights in one arena."""
         pairs = zip(self.records, self.traces, strict=True)
@@ -95,7 +103,7 @@ def judge(folder: Path, protocol: Protocol) -> Judged:
     config = runs.load_config(folder)
     stem = folder / "evaluation" / NAME
     checkpoint = runs.best_checkpoint(folder)
-    key = {"protocol": list(protocol), "checkpoint": hashlib.sha256(checkpoint.read_bytes()).hexdigest()}
+    key = _key(protocol, checkpoint=hashlib.sha256(checkpoint.read_bytes()).hexdigest())
     found = _read(stem, key)
     if found is None:
         result, flights = runs.evaluate(
@@ -126,7 +134,7 @@ def judge_baseline(name: str, config: Config, folder: Path, protocol: Protocol) 
     )  # fmt: skip
     world = msgspec.to_builtins((config.body, config.rays, config.sonar, config.sensing, config.episode))
     text = json.dumps([name, world], sort_keys=True)
-    key = {"protocol": list(protocol), "world": hashlib.sha256(text.encode()).hexdigest()}
+    key = _key(protocol, world=hashlib.sha256(text.encode()).hexdigest())
     folder.mkdir(parents=True, exist_ok=True)
     found = _read(folder / name, key)
     if found is None:
@@ -177,6 +185,11 @@ def read_curve(folder: Path) -> Curve | None:
         judged = step
         rows.append((row["env_steps_total"], row["completed_share"], row["progress_m"]))
     return Curve(*np.array(rows, np.float64).T) if rows else None
+
+
+def _key(protocol: Protocol, **flown: str) -> dict[str, Any]:
+    """Returns by what kept flights are known: how, what, and by which version of the code."""
+    return {"protocol": list(protocol), "version": FLIGHTS_VERSION, **flown}
 
 
 def _last(folder: Path, role: str, name: str) -> float | None:

@@ -15,6 +15,7 @@ from apex_bat.evaluation.claims import Finding, completed, distance_m, progress_
 from apex_bat.evaluation.document import Table
 from apex_bat.evaluation.flights import FlightRecord
 from apex_bat.evaluation.groups import Group
+from apex_bat.evaluation.obstacles import unequal_training
 from apex_bat.evaluation.results import Protocol
 
 Value = Callable[[FlightRecord], float]
@@ -41,6 +42,8 @@ class Comparison(NamedTuple):
     """Of the permutation of seeds; NaN against a baseline, which has none."""
     corrected_p: float
     """The same by Holm, over all comparisons of trained groups in the report."""
+    remark: str = ""
+    """How far the two were not trained alike long."""
 
 
 def findings_table(findings: Sequence[Finding]) -> Table:
@@ -62,12 +65,13 @@ def arena_table(groups: Sequence[Group], protocol: Protocol) -> Table:
             near = np.median(
                 [record.clearance_quantiles_m[3] for run in each.runs for record, _ in run.of_arena(arena)]
             )
-            share = _estimate(each, [arena], completed, 100.0)
+            share = _share(each, [arena])
             cells = (f"{means[0]:.0f}", f"{means[1]:.1f}", f"{means[2]:.1f}", f"{100 * means[3]:.0f}", f"{near:.2f}")
             rows.append((arena, each.label, _seeds(each), share, *cells))
     caption = (
         "Means over seeds and flights; in brackets 95 % intervals over seeds where there are two or more. Progress is "
-        "the net way along the corridor, which a bat that circles on the spot does not make."
+        "the net way along the corridor, which a bat that circles on the spot does not make. To the wall: the median "
+        "over all flights of each flight's median."
     )
     return Table(columns, rows, caption, num_left=2)
 
@@ -77,20 +81,17 @@ def overall_table(groups: Sequence[Group], protocol: Protocol) -> Table:
     columns = ("pilot", "seeds", "completed (%)", "the same, IQM", "distance (m)", "the same, IQM", "progress (m)")
     rows = []
     for each in groups:
-        cells = [
-            _estimate(each, protocol.arenas, value, scale, decimals, statistic)
-            for value, scale, decimals, statistic in (
-                (completed, 100.0, 0, statistics.mean),
-                (completed, 100.0, 0, statistics.interquartile_mean),
-                (distance_m, 1.0, 1, statistics.mean),
-                (distance_m, 1.0, 1, statistics.interquartile_mean),
-                (progress_m, 1.0, 1, statistics.mean),
-            )
+        arenas = protocol.arenas
+        has_middle = each.num_seeds * len(arenas) >= statistics.LEAST_FOR_IQM
+        middles = [
+            _estimate(each, arenas, value, scale, decimals, statistics.interquartile_mean) if has_middle else "-"
+            for value, scale, decimals in ((completed, 100.0, 0), (distance_m, 1.0, 1))
         ]
-        rows.append((each.label, _seeds(each), *cells))
+        distance, progress = (_estimate(each, arenas, value, 1.0, 1) for value in (distance_m, progress_m))
+        rows.append((each.label, _seeds(each), _share(each, arenas), middles[0], distance, middles[1], progress))
     caption = (
         f"All of {', '.join(protocol.arenas)}. IQM: interquartile mean, the mean of the middle half of the values of "
-        "all seeds and arenas."
+        f"all seeds and arenas; not given of fewer than {statistics.LEAST_FOR_IQM}, of which it would leave none out."
     )
     return Table(columns, rows, caption)
 
@@ -114,19 +115,26 @@ def compare(groups: Sequence[Group], protocol: Protocol) -> list[Comparison]:
 
 def comparison_table(comparisons: Sequence[Comparison]) -> Table:
     """Returns the comparisons of trained groups as a table."""
-    columns = ("value", "first", "second", "first less second", "P(first better)", "Hedges' g", "p", "p, Holm")
+    columns = (
+        "value", "first", "second", "first less second", "P(first better)", "Hedges' g", "p", "p, Holm", "training",
+    )  # fmt: skip
     comparisons = [each for each in comparisons if each.second not in BASELINES]
     rows = [
         (
             *_words(each), "-" if math.isnan(each.effect) else f"{each.effect:.2f}", shown_p(each.p),
-            shown_p(each.corrected_p),
+            shown_p(each.corrected_p), each.remark or "alike long",
         )
         for each in comparisons
     ]  # fmt: skip
     num_tests = sum(not math.isnan(each.p) for each in comparisons)
+    tests = (
+        f"p: permutation of seeds, two-sided; corrected for {num_tests} tests."
+        if num_tests
+        else "No tests: they need two seeds of both."
+    )
     caption = (
-        f"All arenas together. p: permutation of seeds, two-sided; corrected for {num_tests} tests. Hedges' g: the "
-        "difference in standard deviations between seeds. P(first better): probability of improvement."
+        f"All arenas together. {tests} Hedges' g: the difference in standard deviations between seeds. P(first "
+        "better): probability of improvement."
     )
     return Table(columns, rows, caption, num_left=3)
 
@@ -141,21 +149,29 @@ def baseline_table(comparisons: Sequence[Comparison]) -> Table:
 def runs_table(groups: Sequence[Group]) -> Table:
     """Returns the facts of each run."""
     columns = (
-        "run", "condition", "seed", "env steps", "updates", "samples per insert", "judged update", "minutes", "begun",
-        "outcome", "commit", "machine",
+        "run", "condition", "seed", "env steps", "updates", "samples per insert", "checkpoints judged", "best update",
+        "minutes", "begun", "outcome", "commit", "machine",
     )  # fmt: skip
-    rows = [_facts_row(run.name, each.label, run.facts) for each in groups if each.is_trained for run in each.runs]
-    return Table(columns, rows, num_left=2)
+    rows = [
+        _facts_row(run.name, each.label, run.facts, run.num_judged)
+        for each in groups
+        if each.is_trained
+        for run in each.runs
+    ]
+    caption = (
+        "Checkpoints judged: how many flew during training, of which the best flew here; where none did, the newest."
+    )
+    return Table(columns, rows, caption, num_left=2)
 
 
-def _facts_row(name: str, label: str, facts: dict[str, Any]) -> tuple[str, ...]:
+def _facts_row(name: str, label: str, facts: dict[str, Any], num_judged: int) -> tuple[str, ...]:
     ratio, wall_s = facts.get("samples_per_insert"), facts.get("wall_s")
     commit, begun = facts.get("commit"), str(facts.get("start") or "-")
     machine = " ".join(str(part) for part in (facts.get("host"), facts.get("platform")) if part)
     outcome = f"{facts.get('outcome') or '-'}{', resumed' if facts.get('resumed') else ''}"
     return (
         name, label, str(facts.get("seed")), _count(facts.get("env_steps")), _count(facts.get("learner_steps")),
-        "-" if ratio is None else f"{ratio:.2f}", _count(facts.get("checkpoint_step")),
+        "-" if ratio is None else f"{ratio:.2f}", str(num_judged), _count(facts.get("checkpoint_step")),
         "-" if wall_s is None else f"{wall_s / 60.0:.1f}", begun[:16].replace("T", " "), outcome,
         commit[:10] + ("+" if commit.endswith("+") else "") if commit else "-", machine or "-",
     )  # fmt: skip
@@ -178,6 +194,7 @@ def _compare(what: str, value: Value, first: Group, second: Group, protocol: Pro
     return Comparison(
         what, first.label, second.label, statistics.bootstrap(statistics.difference, *split),
         statistics.bootstrap(statistics.probability_of_improvement, *split), effect, p, math.nan,
+        unequal_training([*first.runs, *second.runs]) if second.is_trained else "",
     )  # fmt: skip
 
 
@@ -194,6 +211,10 @@ def _estimate(
     statistic: statistics.Statistic = statistics.mean,
 ) -> str:
     return shown(statistics.bootstrap(statistic, [each.scores(arenas, value)]), scale, "", decimals)
+
+
+def _share(each: Group, arenas: Sequence[str]) -> str:
+    return shown(statistics.bootstrap_share(each.scores(arenas, completed)), 100.0, "")
 
 
 def _seeds(each: Group) -> str:

@@ -1,7 +1,9 @@
 """`reproduce` and `evaluate --policy`: what is refused, and a whole small campaign, killed and continued."""
 
+import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -9,8 +11,16 @@ import time
 from pathlib import Path
 
 import pytest
+import typer
+from rich.console import Console
 
-from apex_bat.cli import main
+from apex_bat.cli import main, reproducing
+from apex_bat.config import load
+from apex_bat.evaluation import runs
+from apex_bat.evaluation.reproduction import Planned, plan
+from apex_bat.launching import local
+from apex_bat.launching.lock import InUseError, locked
+from apex_bat.storage import StorageError
 
 SMALL = (
     "actors=1", "bats_per_actor=4", "sonar.rendering=exact", "replay.min_size=200", "replay.capacity=5_000",
@@ -35,6 +45,8 @@ def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         (["reproduce", "--set", "replay.shards=2"], 2, "replay.shards"),
         (["reproduce", "--arenas", "labyrinth"], 2, "no such arena"),
         (["reproduce", "--arenas", "corridor:0-3"], 2, "one arena at a time"),
+        (["reproduce", "--arenas", "simple,simple"], 2, "each once"),
+        (["reproduce", "--set", "train.max_updates=5"], 2, "--budget alone"),
         (["reproduce", "--seeds", "0"], 2, "--seeds"),
         (["reproduce", "nowhere"], 2, "--from"),
         (["reproduce", "--from"], 2, "--from"),
@@ -61,6 +73,51 @@ def test_wrong_usage_starts_nothing(
     assert says in error
     assert "Traceback" not in error
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def planned(tmp_path: Path) -> Planned:
+    return plan(tmp_path, load(None, []), ("memory",), 1, 100)[0]
+
+
+def train(planned: Planned) -> bool:
+    return reproducing._train(planned, "run 1 of 1", Console(file=io.StringIO()), plain=True)
+
+
+def test_what_another_process_trained_meanwhile_is_not_trained_again(
+    planned: Planned, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs.create(planned.folder, planned.config)
+    runs.finish(planned.folder, "completed", env_steps=100)
+    before = (planned.folder / "run.json").read_text()
+    monkeypatch.setattr(local, "train", None)  # a call of it would raise
+    assert train(planned)
+    assert (planned.folder / "run.json").read_text() == before
+
+
+@pytest.mark.parametrize(("outcome", "goes_on"), [("completed", True), ("interrupted", False)])
+def test_how_a_training_ended_is_noted_while_its_folder_is_locked(
+    outcome: local.Outcome, goes_on: bool, planned: Planned, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held: list[bool] = []
+
+    def finish(folder: Path, *_: object, **__: object) -> None:
+        with pytest.raises(InUseError), locked(folder):
+            pass
+        held.append(True)
+        raise StorageError("the disk is full")  # which is no reason to fail a training that is over
+
+    monkeypatch.setattr(local, "train", lambda *_, **__: local.Ended(outcome, "", 100, 10, 1.0))
+    monkeypatch.setattr(runs, "finish", finish)
+    assert train(planned) is goes_on
+    assert held == [True]
+
+
+def test_a_training_that_fails_ends_the_campaign(planned: Planned, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "train", lambda *_, **__: local.Ended("failed", "actor-0 died", 100, 10, 1.0))
+    with pytest.raises(typer.Exit):
+        train(planned)
+    assert json.loads((planned.folder / "run.json").read_text())["outcome"] == "failed"
 
 
 def test_a_baseline_is_evaluated_without_a_run(
@@ -108,7 +165,7 @@ def test_a_killed_campaign_goes_on_and_ends_in_a_report(tmp_path: Path) -> None:
     assert facts["outcome"] == "completed"
     assert facts["env_steps"] >= 1500
     text = (folder / "report" / "report.md").read_text()
-    assert "memory 1, onset 1" in text
+    assert re.search(r"Seeds: memory \(\d+ other settings, \w+\) 1, onset \(\d+ other settings, \w+\) 1\.", text)
     assert "other flights than the thesis's" in text
     assert (folder / "report" / "index.html").stat().st_size > 100_000
     evaluate_under_other_settings(folder / "memory-0", tmp_path / "out.json")

@@ -47,7 +47,14 @@ def judged(
     poses = {arena: np.tile(np.array([*middle, 1.5], np.float32), (5, 1)) for arena, middle in place.items()}
     traces = [Trace(poses[each.arena], clearance_m, actions) for each in records]
     base = msgspec.structs.replace(config or Config(), seed=seed, condition=condition)
-    known = {"env_steps": 180_000, "learner_steps": 22_000, "seed": seed, "commit": "0123456789abcdef", "host": "lab"}
+    known = {
+        "env_steps": 180_000,
+        "learner_steps": 22_000,
+        "seed": seed,
+        "commit": "0123456789abcdef",
+        "host": "lab",
+        "outcome": "completed",
+    }
     curve = Curve(np.array([1e4, 2e4, 3e4]) + 100 * seed, np.array([0.0, 0.5, 0.9]), np.array([1.0, 70.0, 140.0]))
     return Judged(f"{condition}-{seed}", condition, base, records, traces, known | facts, curve)
 

@@ -1,6 +1,7 @@
 """The report: the answer first, every figure loaded, nothing made up."""
 
 import base64
+import dataclasses
 import re
 import shutil
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from apex_bat.config import load
 from apex_bat.evaluation import document, figures
 from apex_bat.evaluation.groups import group
 from apex_bat.evaluation.plates import CAPTIONS
@@ -51,7 +53,11 @@ def test_a_report_on_one_seed_gives_no_intervals_and_no_verdicts(one_seed: Path)
     assert "| reproduced |" not in text
     assert "| not reproduced |" not in text
     assert "is inferred" in text
-    assert "| memory-0 | memory | 0 | 180,000 | 22,000 |" in text
+    assert "| memory-0 | memory | 0 | 180,000 | 22,000 | - | 3 |" in text
+    assert "| memory | 1 | 82 | - | 1" in text, "no interquartile mean of three values"
+    assert "chosen that flew best in the training arena among the 3 that were judged" in text
+    assert "14 of the 15 starts" in text
+    assert "corrected for" not in text
     assert "nan" not in text
 
 
@@ -77,6 +83,50 @@ def test_three_seeds_give_verdicts_intervals_and_corrected_tests(make_judged: Ma
     # the least p of three seeds against three is 0.1; Holm over 6 tests makes 0.6 of it
     assert "p = 0.6 (Holm; one test alone can reach 0.1 at best)" in answer
     assert "\u2020" not in answer
+    assert "memory 100 % [97, 100]\u2021;" in answer
+    assert "\u2021 No resample differs: a share whose flights all ended alike has Wilson's interval" in answer
+    assert "99, 94 and 86 % (of 3 seeds), 99, 96 and 91 % (of 5 seeds) of the time" in text
+    assert text.count("alike long |") == 6
+
+
+def test_unequal_training_is_told_wherever_conditions_are_compared(make_judged: MakeJudged, tmp_path: Path) -> None:
+    runs = [make_judged("memory", seed, env_steps=360_000) for seed in range(3)]
+    runs += [make_judged("onset", seed, completed=(3, 3, 3)) for seed in range(3)]
+    write_report(runs, [], PROTOCOL, tmp_path, no_figures)
+    text = (tmp_path / "report.md").read_text()
+    assert "at best) (trained for 180,000 to 360,000 steps)." in text.split("\n\n")[1]
+    assert text.count("| trained for 180,000 to 360,000 steps |\n") == 2
+
+
+def test_the_method_speaks_of_all_runs(make_judged: MakeJudged, tmp_path: Path) -> None:
+    other = load(None, ["arena=circle", "sonar.rendering=exact", "episode.evaluation_steps=500"])
+    unjudged = make_judged("memory", 1, config=other)
+    runs = [make_judged("memory"), dataclasses.replace(unjudged, curve=None)]
+    write_report(runs, baselines(make_judged), PROTOCOL, tmp_path, no_figures)
+    text = (tmp_path / "report.md").read_text()
+    assert "trained in circle or simple." in text
+    assert "until 1000 or 500 steps" in text
+    assert "rendered by exact or thesis." in text
+    assert "Of 1 of 2 runs no checkpoint was judged: the newest was taken." in text
+    assert "They flew with body, rays, ear and time limit of the first run given. memory (arena circle, " in text
+    write_report([runs[1]], [], PROTOCOL, tmp_path, no_figures)
+    assert "flew best" not in (tmp_path / "report.md").read_text()
+
+
+def test_comparisons_of_settings_that_all_runs_share_are_in_the_answer(make_judged: MakeJudged, tmp_path: Path) -> None:
+    thesis = load(Path(__file__).resolve().parents[2] / "configs" / "thesis.toml")
+    runs = [make_judged(name, seed, config=thesis) for name in ("memory", "onset") for seed in range(2)]
+    write_report(runs, [], PROTOCOL, tmp_path, no_figures)
+    text = (tmp_path / "report.md").read_text()
+    assert re.search(r"memory \(\d+ other settings, \w+\) less onset", text.split("\n\n")[1])
+    assert re.search(
+        r"memory \(\d+ other settings, \w+\) differs from the default in actors 1, bats_per_actor 1, ", text
+    )
+
+
+def test_no_correction_is_claimed_where_there_are_no_tests(make_judged: MakeJudged, tmp_path: Path) -> None:
+    write_report([make_judged("memory"), make_judged("onset")], [], PROTOCOL, tmp_path, no_figures)
+    assert "No tests: they need two seeds of both." in (tmp_path / "report.md").read_text()
 
 
 def test_two_seeds_are_marked(make_judged: MakeJudged, tmp_path: Path) -> None:

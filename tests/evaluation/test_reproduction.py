@@ -8,6 +8,7 @@ import pytest
 from apex_bat.config import Config, ConfigError, load
 from apex_bat.evaluation import reproduction, runs
 from apex_bat.evaluation.reproduction import Planned, begin, clear, plan, train_all
+from apex_bat.evaluation.results import Protocol
 
 CONDITIONS = ("memory", "onset")
 
@@ -100,6 +101,17 @@ def test_a_folder_holds_one_campaign(tmp_path: Path) -> None:
         begin(folder, plan(folder, Config(), CONDITIONS, 1, 200))
     with pytest.raises(ConfigError, match="other settings"):
         begin(folder, plan(folder, load(None, ["learner.learning_rate=0.1"]), CONDITIONS, 1, 100))
+    with pytest.raises(ConfigError, match=r"learner.learning_rate: 0.00025 \| 0.1"):
+        begin(folder, plan(folder, load(None, ["learner.learning_rate=0.1"]), CONDITIONS, 1, 100))
+    # what does not change the experiment may change, and a first seed may be another
+    begin(folder, plan(folder, load(None, ["seed=3", "recording.curves=false", "train.threads=2"]), CONDITIONS, 1, 100))
+    facts = json.loads((folder / "campaign.json").read_text())
+    del facts["settings"]["sensing"]["onset"]  # begun by a version that had no such setting
+    (folder / "campaign.json").write_text(json.dumps(facts))
+    begin(folder, plan(folder, Config(), CONDITIONS, 1, 100))
+    (folder / "campaign.json").write_text('{"settings": {"nonsense": 1}}')
+    with pytest.raises(ConfigError, match="none of this version"):
+        begin(folder, plan(folder, Config(), CONDITIONS, 1, 100))
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "file").write_text("")
     with pytest.raises(runs.RunError, match="no campaign"):
@@ -116,3 +128,18 @@ def test_what_would_not_be_comparable_is_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=says):
         reproduction.plan(tmp_path, load(None, overrides), conditions, 1, 100)
+
+
+@pytest.mark.parametrize("name", ["max_minutes", "max_env_steps", "max_updates"])
+def test_a_limit_that_the_budget_would_replace_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"train.{name}=3: trainings of a campaign end by --budget"):
+        reproduction.refuse_limits(["seed=1", f"train.{name}=3"])
+    reproduction.refuse_limits(["train.threads=2"])
+
+
+def test_a_run_given_twice_is_refused_by_whatever_path(tmp_path: Path) -> None:
+    (tmp_path / "memory-0").mkdir()
+    (tmp_path / "same").symlink_to(tmp_path / "memory-0")
+    for again in (tmp_path / "memory-0", tmp_path / "x" / ".." / "memory-0", tmp_path / "same"):
+        with pytest.raises(runs.RunError, match="given twice"):
+            reproduction.judge_all([tmp_path / "memory-0", again], tmp_path, Protocol(), lambda _: None)

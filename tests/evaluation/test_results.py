@@ -35,6 +35,14 @@ def test_another_protocol_or_another_world_is_flown_anew(tmp_path: Path) -> None
     assert judge_baseline("straight", faster, tmp_path, PROTOCOL).records[0].distance_m < 1.01
 
 
+def test_flights_of_another_version_of_the_code_are_flown_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    judge_baseline("straight", CONFIG, tmp_path, PROTOCOL)
+    monkeypatch.setattr(results, "FLIGHTS_VERSION", results.FLIGHTS_VERSION + 1)
+    monkeypatch.setattr(results, "fly", None)
+    with pytest.raises(TypeError):  # it flies
+        judge_baseline("straight", CONFIG, tmp_path, PROTOCOL)
+
+
 def test_torn_files_are_flown_anew(tmp_path: Path) -> None:
     first = judge_baseline("straight", CONFIG, tmp_path, PROTOCOL)
     path = tmp_path / "straight.npz"

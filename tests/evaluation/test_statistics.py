@@ -118,9 +118,35 @@ def test_flights_do_not_count_as_seeds() -> None:
 def test_flights_are_drawn_within_a_seed() -> None:
     scores = np.tile(np.array([1.0, 0.0] * 8), (3, 1, 1))  # equal seeds: all spread is that of flights
     interval = statistics.bootstrap(statistics.mean, [scores])
-    # 48 draws of 0 or 1: a standard error of 0.072
-    assert interval.low == pytest.approx(0.5 - 1.96 * 0.0722, abs=0.03)
-    assert interval.high == pytest.approx(0.5 + 1.96 * 0.0722, abs=0.03)
+    # 16 draws of 0 or 1, the same for all seeds, because flight k of each began at the same pose: sd 0.125
+    assert interval.low == pytest.approx(0.5 - 1.96 * 0.125, abs=0.03)
+    assert interval.high == pytest.approx(0.5 + 1.96 * 0.125, abs=0.03)
+
+
+def test_starts_are_drawn_once_for_both_conditions_and_for_baselines() -> None:
+    # Two conditions that are alike but for one point: hard starts are hard for both, and their difference is sure.
+    scores = np.tile(np.array([1.0, 0.0] * 8), (3, 2, 1))
+    for split in (([scores + 1.0, scores],), ([scores + 1.0], [scores[:1]])):
+        interval = statistics.bootstrap(statistics.difference, *split)
+        assert (interval.low, interval.estimate, interval.high) == pytest.approx((1.0, 1.0, 1.0))
+
+
+def test_a_share_of_flights_that_all_ended_alike_has_wilsons_interval() -> None:
+    interval = statistics.bootstrap_share(np.ones((3, 3, 15)))
+    assert (interval.low, interval.high) == pytest.approx(statistics.wilson_interval(135, 135))
+    assert interval.low < 0.99
+    assert interval.is_wilson
+    mixed = np.ones((3, 3, 15))
+    mixed[0, 0, 0] = 0.0
+    assert not statistics.bootstrap_share(mixed).is_alike
+    assert statistics.bootstrap_share(mixed) == statistics.bootstrap(statistics.mean, [mixed])
+    assert not statistics.bootstrap_share(np.ones((1, 3, 15))).is_given, "one seed has no interval of any kind"
+
+
+def test_an_interval_without_width_is_known_as_one() -> None:
+    apart = statistics.bootstrap(statistics.difference, [np.ones((3, 1, 15)), np.zeros((3, 1, 15))])
+    assert apart.is_alike
+    assert not statistics.bootstrap(statistics.mean, [np.ones((1, 1, 15))]).is_alike
 
 
 def test_one_seed_gives_no_interval() -> None:

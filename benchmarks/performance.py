@@ -42,7 +42,7 @@ TARGETS: tuple[Target, ...] = (
     Target("sample 512 of 1,000,000, in cpprb's time", "replay.sample_512.cap_1000000.ratio_to_cpprb", 0.75, False),
     Target("memory of 1,000,000 transitions [MB]", "replay.resident_mb.cap_1000000", 600, False),
     Target("server saturated by 4 actors and a learner: inserted/s", "wire.server.inserted_per_s", 100_000, True),
-    Target("the same run: batches of 512 a second", "wire.server.batches_512_per_s", 500, True),
+    Target("batches of 512 a second from the same server meanwhile", "wire.server.batches_512_per_s", 500, True),
     Target("insert of 50, acknowledged, 99th percentile [ms]", "wire.insert_50.p99_ms", 2, False),
     Target("weights, 250,000 parameters, at the last of 8 actors [ms]", "wire.weights_8.max_ms", 100, False),
     Target("learner on the real server, in rates of in-memory batches", "learner.relative_updates", 0.9, True),
@@ -83,6 +83,13 @@ def document(measured: dict[str, dict[str, Any]]) -> str:
         numbers = " | ".join(_number(record[key]) for key in ("median", "min", "max"))
         lines.append(f"| `{name}` | {record['unit']} | {numbers} | {record['runs']} |")
     return "\n".join(lines) + "\n"
+
+
+def summary_line(measured: dict[str, dict[str, Any]]) -> str:
+    """Returns how many targets are met and which are missed by how much, in one paragraph for the README."""
+    verdicts = {target.what.partition(" [")[0]: verdict(target, measured[target.name]["median"]) for target in TARGETS}
+    missed = [f"{what}, by {how.rpartition(' ')[2]}" for what, how in verdicts.items() if how != "met"]
+    return f"{len(verdicts) - len(missed)} of {len(verdicts)} targets are met. Missed: {'; '.join(missed)}."
 
 
 def _number(value: float) -> str:

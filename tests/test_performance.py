@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.performance import TARGETS, Target, document, records, verdict
+from benchmarks.performance import TARGETS, Target, document, records, summary_line, verdict
 
-PAGE = Path(__file__).parents[1] / "docs" / "performance.md"
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "performance.md"
 
 
 def test_the_page_is_the_one_made_from_the_committed_results() -> None:
@@ -15,6 +16,11 @@ def test_the_page_is_the_one_made_from_the_committed_results() -> None:
 
 def test_every_target_is_measured() -> None:
     assert {target.name for target in TARGETS} <= records().keys()
+
+
+def test_the_readme_says_which_targets_are_missed() -> None:
+    readme = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    assert summary_line(records()) in readme
 
 
 @pytest.mark.parametrize(

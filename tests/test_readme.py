@@ -26,6 +26,14 @@ def test_the_bat_of_the_readme_completes_fourteen_of_fifteen_in_simple() -> None
     assert simple["completed"] >= 14
 
 
+def test_what_other_starts_gave_is_said() -> None:
+    other = json.loads((ROOT / "docs" / "results" / "memory_other_starts.json").read_text(encoding="utf-8"))
+    completed = {row["arena"]: row["completed"] for row in other["summary"]}
+    assert other["learner_step"] == RESULT["learner_step"]
+    sentence = f"{completed['simple']} in simple, {completed['narrow']} in narrow and {completed['circle']} in circle"
+    assert sentence in " ".join(README.split())
+
+
 def test_seed_time_and_size_of_the_training_are_those_of_the_result() -> None:
     training = RESULT["training"]
     minutes, seconds = divmod(round(training["wall_s"]), 60)

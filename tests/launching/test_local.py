@@ -88,6 +88,7 @@ def endless(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
         eventually(lambda: not any(is_alive(pid) for pid in pids), 15.0, "all roles are gone")
 
 
+@pytest.mark.slow
 def test_a_whole_run_learns_evaluates_and_records(tmp_path: Path) -> None:
     run = tmp_path / "run"
     process = start(run, train__max_updates="150")
@@ -174,6 +175,7 @@ def test_a_run_folder_in_use_is_not_overwritten(tmp_path: Path) -> None:
     assert "Traceback" not in output
 
 
+@pytest.mark.slow
 def test_a_port_in_use_is_named_and_nothing_is_left_running(tmp_path: Path) -> None:
     import socket
 

@@ -19,12 +19,13 @@ import threading
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apex_bat.replay.buffer import BufferCounters, ReplayBuffer
+from apex_bat.storage import sync_folder
 
 logger = logging.getLogger(__name__)
 
@@ -168,6 +169,29 @@ def read_snapshot(path: Path, buffer: ReplayBuffer) -> tuple[dict[str, Any], Pat
     raise SnapshotError("; ".join(reasons))
 
 
+def read_header(file: BinaryIO, path: Path) -> dict[str, Any]:
+    """Returns the header of an open snapshot, its checksum compared.
+
+    Raises:
+        SnapshotError: the file is no snapshot, of another version, cut short or damaged.
+        ValueError: the header is not JSON.
+    """
+    prefix = file.read(PREFIX.size)
+    if len(prefix) < PREFIX.size or not prefix.startswith(MAGIC):
+        raise SnapshotError(f"{path}: not a snapshot of the replay")
+    _, version, header_crc, offset, length = PREFIX.unpack(prefix)
+    if version != VERSION:
+        raise SnapshotError(f"{path}: version {version}; this program reads {VERSION}")
+    if offset + length > path.stat().st_size:
+        raise SnapshotError(f"{path}: cut short")
+    file.seek(offset)
+    text = file.read(length)
+    if zlib.crc32(text) != header_crc:
+        raise SnapshotError(f"{path}: its header is damaged")
+    header: dict[str, Any] = json.loads(text)
+    return header
+
+
 def previous_of(path: Path) -> Path:
     """Returns where the snapshot before the newest lies."""
     return path.with_name(path.name + ".previous")
@@ -208,30 +232,12 @@ def _replace(beside: Path, path: Path) -> None:
     if path.exists():
         path.replace(previous_of(path))
     beside.replace(path)
-    if os.name == "posix":  # the renaming itself lasts only when the folder is synced
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+    sync_folder(path.parent)  # the renaming itself lasts only then
 
 
 def _read(path: Path, buffer: ReplayBuffer) -> dict[str, Any]:
-    size = path.stat().st_size
     with path.open("rb") as file:
-        prefix = file.read(PREFIX.size)
-        if len(prefix) < PREFIX.size or not prefix.startswith(MAGIC):
-            raise SnapshotError(f"{path}: not a snapshot of the replay")
-        _, version, header_crc, offset, length = PREFIX.unpack(prefix)
-        if version != VERSION:
-            raise SnapshotError(f"{path}: version {version}; this program reads {VERSION}")
-        if offset + length > size:
-            raise SnapshotError(f"{path}: cut short")
-        file.seek(offset)
-        text = file.read(length)
-        if zlib.crc32(text) != header_crc:
-            raise SnapshotError(f"{path}: its header is damaged")
-        header = json.loads(text)
+        header = read_header(file, path)
         wanted = _shape_of(buffer)
         for name, value in header["fits"].items():
             if value != wanted.get(name):

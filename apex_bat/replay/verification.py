@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import zlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from apex_bat.replay.snapshot import MAGIC, PREFIX, VERSION, SnapshotError, previous_of
+from apex_bat.replay.snapshot import SnapshotError, previous_of, read_header
 
 
 class SnapshotFacts(NamedTuple):
@@ -50,19 +49,7 @@ def verify(path: Path) -> SnapshotFacts | None:
 def _verify(path: Path) -> SnapshotFacts:
     size = path.stat().st_size
     with path.open("rb") as file:
-        prefix = file.read(PREFIX.size)
-        if len(prefix) < PREFIX.size or not prefix.startswith(MAGIC):
-            raise SnapshotError(f"{path}: not a snapshot of the replay")
-        _, version, header_crc, offset, length = PREFIX.unpack(prefix)
-        if version != VERSION:
-            raise SnapshotError(f"{path}: version {version}; this program reads {VERSION}")
-        if offset + length > size:
-            raise SnapshotError(f"{path}: cut short")
-        file.seek(offset)
-        text = file.read(length)
-        if zlib.crc32(text) != header_crc:
-            raise SnapshotError(f"{path}: its header is damaged")
-        header: dict[str, Any] = json.loads(text)
+        header = read_header(file, path)
         total = hashlib.sha256()
         for entry in sorted(header["sections"], key=lambda entry: (entry["name"], entry["first"])):
             if not 0 <= entry["offset"] <= entry["offset"] + entry["bytes"] <= size:

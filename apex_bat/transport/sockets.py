@@ -2,8 +2,12 @@
 
 An `ipc` address must lie in a folder that only its owner can enter. A TCP address that is not loopback needs CURVE
 keys; a loopback address without them is taken with a warning, because every user of the machine can connect to it.
-Queues, kernel buffers and message sizes are bounded, dead peers are noticed by heartbeats, connections that do not
-introduce themselves are closed, and nothing lingers when a socket is closed.
+Queues, kernel buffers and message sizes are bounded, the kernel notices dead peers, connections that do not introduce
+themselves are closed, and nothing lingers when a socket is closed.
+
+ZeroMQ's own heartbeats stay off: with them libzmq 4.3.5 aborts the process when a peer dies whose messages have filled
+the queue (its issues 3937, 4364 and 4767, open). TCP's keepalive and user timeout notice a pulled cable as well, and a
+Unix socket has none to pull.
 """
 
 from __future__ import annotations
@@ -33,8 +37,10 @@ logger = logging.getLogger(__name__)
 MAX_MESSAGE_BYTES = Transport().max_message_bytes
 HIGH_WATER = 64  # messages queued in each direction of a connection
 KERNEL_BUFFER_BYTES = 1 << 18  # without it the kernel took 115 messages past a high-water mark of 10 (measured)
-HEARTBEAT_MS = 1000
-HEARTBEAT_TIMEOUT_MS = 3000  # silence after which a peer counts as gone: a pulled cable shows no other sign
+KEEPALIVE_S = 1  # of silence until TCP asks whether the peer is there, and between its questions
+LOST_MS = (
+    4000  # without an answer to data or question, after which a peer counts as gone: a pulled cable shows no other
+)
 RECONNECT_MS = 50
 RECONNECT_MAX_MS = 1000
 HANDSHAKE_MS = 5000  # a connection that has not introduced itself by then is closed
@@ -226,8 +232,11 @@ def _bound(
         zmq.SNDBUF: KERNEL_BUFFER_BYTES,
         zmq.RCVBUF: KERNEL_BUFFER_BYTES,
         zmq.MAXMSGSIZE: max_message_bytes,
-        zmq.HEARTBEAT_IVL: HEARTBEAT_MS,
-        zmq.HEARTBEAT_TIMEOUT: HEARTBEAT_TIMEOUT_MS,
+        zmq.TCP_KEEPALIVE: 1,
+        zmq.TCP_KEEPALIVE_IDLE: KEEPALIVE_S,
+        zmq.TCP_KEEPALIVE_INTVL: KEEPALIVE_S,
+        zmq.TCP_KEEPALIVE_CNT: LOST_MS // (1000 * KEEPALIVE_S) - 1,
+        zmq.TCP_MAXRT: LOST_MS,
         zmq.HANDSHAKE_IVL: HANDSHAKE_MS,
         zmq.BACKLOG: BACKLOG,
         zmq.RECONNECT_IVL: RECONNECT_MS,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -116,3 +118,43 @@ def test_an_oversized_message_is_not_received() -> None:
         large.close()
         small.close()
         listener.close()
+
+
+FILLS = """
+import sys, time, zmq
+from apex_bat.transport.sockets import Connection
+
+connection = Connection(zmq.DEALER, sys.argv[1], high_water=1000)
+for _ in range(300):
+    connection.socket.send(bytes(1000))
+print("full", flush=True)
+time.sleep(60)
+"""
+OUTLIVES = """
+import subprocess, sys, time, zmq
+from apex_bat.transport.sockets import Listener
+
+listener = Listener(zmq.ROUTER, sys.argv[1])
+peer = subprocess.Popen([sys.executable, "-c", sys.argv[2], listener.address], stdout=subprocess.PIPE)
+assert peer.stdout is not None and peer.stdout.readline().strip() == b"full"
+time.sleep(1.0)
+peer.kill()
+peer.wait()
+time.sleep(1.5)  # what ZeroMQ does each second, it does in this time
+received = 0
+while listener.socket.poll(200):
+    listener.socket.recv_multipart()
+    received += 1
+listener.close()
+print("received", received > 0)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Unix sockets")
+@pytest.mark.parametrize("kind", ["ipc", "tcp"])
+def test_a_peer_that_dies_with_a_full_queue_does_not_end_the_listener(kind: str, tmp_path: Path) -> None:
+    tmp_path.chmod(0o700)
+    address = f"ipc://{tmp_path}/socket" if kind == "ipc" else "tcp://127.0.0.1:0"
+    done = subprocess.run([sys.executable, "-c", OUTLIVES, address, FILLS], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr  # libzmq ends the whole process where an assertion of its own fails
+    assert done.stdout == "received True\n"

@@ -147,3 +147,5 @@ class Episode(Section, frozen=True):
     """Time limit in evaluation: 150 m."""
     safe_start_m: Positive = 0.4
     """Least clearance of a start pose; a way out must exist too."""
+    listening_steps: Annotated[int, Meta(ge=0, le=100)] = 2
+    """Straight steps from a start after which a way out must still exist; after 2 the memory of 3 echoes is full."""

@@ -1,7 +1,10 @@
 """Safe starts: poses from which a bat can fly on, spread evenly over the drivable region.
 
 At 3 m/s and 18 degrees a step, a robot that faces a wall from half a metre cannot escape whatever it does. So a start
-must be clear of the walls, and a way out must exist: straight flight or a full turn to the left or right stays clear.
+must be clear of the walls, and a way out must exist: straight flight or a full turn to the left or right stays clear,
+and still does after the first `episode.listening_steps` straight ones. With two of them the memory of three echoes is
+full before anything must be decided. Without them many a start hangs on what a single echo tells, too little to choose
+the side by (figures in docs/simulation.md).
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ WAY_OUT_M = 1.5
 NUM_STARTS = 4096
 """Safe poses that are drawn once for each arena; an episode begins at one of them, which costs 2 us instead of 300."""
 CANDIDATES = 256
-"""Poses drawn at a time; about three of four are safe in the thesis's arenas."""
+"""Poses drawn at a time; about half of them are safe in the thesis's arenas."""
 MAX_MISSES = 32
 """After this many draws in a row without a safe pose the arena is said to have none."""
 
@@ -47,7 +50,8 @@ class StartRegion:
         self._ground = ground_plan([arena])
         self._radius_m = body.diameter_m / 2
         self._safe_m = max(episode.safe_start_m, self._radius_m)
-        self._ways_out = _ways_out(body)
+        self._ways_out = _ways_out(body, episode.listening_steps)
+        self._listening_steps = episode.listening_steps
         corners = np.array(arena.corners())
         self._low = corners.min(axis=0)
         columns, rows = np.ceil((corners.max(axis=0) - self._low) / CELL_M).astype(int) + 1
@@ -89,7 +93,10 @@ class StartRegion:
             safe = np.concatenate([safe, poses[is_safe]])
             misses = 0 if is_safe.any() else misses + 1
             if misses == MAX_MISSES:
-                raise self._no_start("no way out was found from any pose that was tried")
+                straight = f" after {self._listening_steps} straight steps (episode.listening_steps)"
+                raise self._no_start(
+                    f"no way out was found{straight * bool(self._listening_steps)} from any pose that was tried"
+                )
         return safe[:count]
 
     def _find_cells(self) -> NDArray[np.float64]:
@@ -124,12 +131,16 @@ class StartRegion:
         return ArenaError(f"arena {self._arena.name}: its walls leave no safe start: {why}")
 
 
-def _ways_out(body: Body) -> NDArray[np.float64]:
-    """Returns points (3 actions, points, 2), metres ahead and to the left, on the actions' paths from the start."""
-    half_steps = math.ceil(2 * WAY_OUT_M / step_length_m(body))
+def _ways_out(body: Body, listening_steps: int) -> NDArray[np.float64]:
+    """Returns points (3 actions, points, 2), metres ahead and to the left, on the actions' paths from the start.
+
+    The paths begin with `listening_steps` straight steps, and then hold one action for `WAY_OUT_M`.
+    """
+    half_m, half_rad = step_length_m(body) / 2, step_turn_rad(body) / 2
+    turns = [np.zeros(3)] * (2 * listening_steps) + [TURN_SIGN * half_rad] * math.ceil(WAY_OUT_M / half_m)
     poses = np.zeros((3, 3))
     paths = [poses[:, :2]]
-    for _ in range(half_steps):
-        poses = fly_arc(poses, TURN_SIGN * step_turn_rad(body) / 2, np.full(3, step_length_m(body) / 2))
+    for turn_rad in turns:
+        poses = fly_arc(poses, turn_rad, np.full(3, half_m))
         paths.append(poses[:, :2])
     return np.asarray(np.stack(paths, axis=1))

@@ -90,6 +90,7 @@ CASES = {
     "episode.training_steps": Case(2),
     "episode.evaluation_steps": Case(2, world={"evaluation": True}),
     "episode.safe_start_m": Case(0.6),
+    "episode.listening_steps": Case(0),
 }
 
 

@@ -16,26 +16,44 @@ def region(name: str) -> StartRegion:
     return start_region(load_arena(name), BODY, EPISODE)
 
 
-@pytest.mark.parametrize("name", ["simple", "narrow", "maze"])
-def test_from_every_start_one_action_held_for_ten_steps_touches_nothing(name: str) -> None:
-    ground, generator = ground_plan([load_arena(name)]), np.random.default_rng(1)
-    starts = np.array([region(name).sample(generator) for _ in range(60)])
-    arena = np.zeros(60, np.int64)
-    assert ground.clearance_m(starts[:, :2], arena).min() > EPISODE.safe_start_m
-    survives = np.zeros(60, bool)
+def survivors(name: str, starts: np.ndarray, straight_steps: int) -> np.ndarray:
+    """Whether a bat flies straight and then ten steps of one action, whichever is best, without touching a wall."""
+    ground, count = ground_plan([load_arena(name)]), len(starts)
+    survives = np.zeros(count, bool)
     for sign in TURN_SIGN:
-        poses, clear = starts, np.ones(60, bool)
-        for _ in range(10):
-            poses = fly_arc(poses, np.full(60, sign * step_turn_rad(BODY)), np.full(60, step_length_m(BODY)))
-            clear &= ground.clearance_m(poses[:, :2], arena) > BODY.diameter_m / 2
+        poses, clear = starts, np.ones(count, bool)
+        for turn in [0.0] * straight_steps + [sign] * 10:
+            poses = fly_arc(poses, np.full(count, turn * step_turn_rad(BODY)), np.full(count, step_length_m(BODY)))
+            clear &= ground.clearance_m(poses[:, :2], np.zeros(count, np.int64)) > BODY.diameter_m / 2
         survives |= clear
-    assert survives.all()
+    return survives
 
 
-def test_facing_a_wall_from_half_a_metre_is_not_safe_and_facing_away_is() -> None:
+@pytest.mark.parametrize("name", ["simple", "narrow", "maze"])
+def test_from_every_start_two_straight_steps_and_then_one_action_held_touch_nothing(name: str) -> None:
+    generator = np.random.default_rng(1)
+    starts = np.array([region(name).sample(generator) for _ in range(60)])
+    ground = ground_plan([load_arena(name)])
+    assert ground.clearance_m(starts[:, :2], np.zeros(60, np.int64)).min() > EPISODE.safe_start_m
+    assert survivors(name, starts, straight_steps=2).all()
+
+
+def test_without_listening_steps_some_starts_allow_no_straight_step() -> None:
+    hasty = start_region(load_arena("narrow"), BODY, Episode(listening_steps=0))
+    generator = np.random.default_rng(1)
+    starts = np.array([hasty.sample(generator) for _ in range(60)])
+    assert survivors("narrow", starts, straight_steps=0).all()
+    assert not survivors("narrow", starts, straight_steps=1).all()
+
+
+def test_facing_a_wall_is_safe_from_so_far_that_the_bat_may_listen_before_it_turns() -> None:
     wall_m = 4.525  # inner face of the eastern wall of simple
     poses = np.array([[wall_m - 0.5, 0.0, 0.0], [wall_m - 0.5, 0.0, np.pi / 2]])
     np.testing.assert_array_equal(region("simple").is_safe(poses), [False, True])
+    facing = np.array([[wall_m - distance_m, 0.0, 0.0] for distance_m in (0.75, 1.0)])
+    np.testing.assert_array_equal(region("simple").is_safe(facing), [False, True])
+    hasty = start_region(load_arena("simple"), BODY, Episode(listening_steps=0))
+    np.testing.assert_array_equal(hasty.is_safe(facing), [True, True])
 
 
 def test_starts_reach_every_part_of_the_corridor_and_every_heading() -> None:

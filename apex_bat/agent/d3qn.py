@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from apex_bat.agent.losses import double_q_target, td_errors, weighted_loss
+from apex_bat.agent.mirror import mirror_batch
 from apex_bat.agent.network import DuelingNetwork, Values, load_parameters, parameters_of
 from apex_bat.config import Config, settings
 from apex_bat.experience import Batch
@@ -60,6 +61,8 @@ class D3QN:
 
     def update(self, batch: Batch) -> Update:
         """Takes one step of gradient descent on a batch and copies the target network when its time has come."""
+        if self._settings.mirror:  # every other transition, the other ones at the next update: no random state to keep
+            batch = mirror_batch(batch, (np.arange(len(batch.actions)) + self.num_updates) % 2 == 1)
         online, target = self._values
         states = [self._moved(array) for array in batch.states]
         next_states = [self._moved(array) for array in batch.next_states]

@@ -61,6 +61,8 @@ class Learner(Section, frozen=True):
     """Updates between copies of the target network; 0: the soft update below instead. Ape-X 2,500."""
     target_tau: Share = 0.001
     """Soft update: share of the online network taken over after each update (thesis: 0.001)."""
+    mirror: bool = True
+    """Whether half of each batch is mirrored: left for right in ears and turns."""
     weights_period: Count = 25
     """Updates between broadcasts of the weights."""
     precision: Literal["float32", "bfloat16"] = "float32"

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from apex_bat.agent.d3qn import D3QN
+from apex_bat.agent.mirror import mirror_batch
 from apex_bat.config import Config
 from apex_bat.config.settings import Learner, Network
 from apex_bat.experience import Batch, States
@@ -15,8 +16,10 @@ SMALL = Network(channels=(4,), strides=(2,), hidden=(32,), input_scale=1.0)
 
 
 def agent(**learner: object) -> D3QN:
+    """Learns without mirror images, which the problems below do not have."""
     torch.manual_seed(0)
-    return D3QN(msgspec.structs.replace(Config(), network=SMALL, learner=Learner(**learner)), CPU)  # type: ignore[arg-type]
+    settings = Learner(**({"mirror": False} | learner))  # type: ignore[arg-type]
+    return D3QN(msgspec.structs.replace(Config(), network=SMALL, learner=settings), CPU)
 
 
 def states(kinds: np.ndarray) -> States:
@@ -163,7 +166,8 @@ def test_every_setting_of_the_learner_changes_what_is_learned(change: dict[str, 
 def test_targets_are_without_dropout() -> None:
     torch.manual_seed(0)
     network = msgspec.structs.replace(SMALL, dropout=0.5)
-    learner = D3QN(msgspec.structs.replace(Config(), network=network, learner=Learner(learning_rate=1e-12)), CPU)
+    settings = Learner(learning_rate=1e-12, mirror=False)
+    learner = D3QN(msgspec.structs.replace(Config(), network=network, learner=settings), CPU)
     kinds = np.zeros(32, np.int64)
     batch = two_state_batch(np.random.default_rng(0), 32)._replace(next_states=states(kinds))
     seen: list[torch.Tensor] = []
@@ -174,3 +178,14 @@ def test_targets_are_without_dropout() -> None:
     assert following_online.std(dim=0).max() == 0.0, "32 times the same state"
     assert following_target.std(dim=0).max() == 0.0
     assert now[batch.states.echoes[:, 4, 0] == 1.0].std(dim=0).max() > 0.0, "what is learned has dropout"
+
+
+def test_with_mirror_every_other_transition_is_learnt_from_the_other_side_and_then_the_others() -> None:
+    batch = two_state_batch(np.random.default_rng(0), size=6)
+    odd = np.arange(6) % 2 == 1
+    plain, mirrored = agent(), agent(mirror=True)
+    for rows in (odd, ~odd):
+        expected, got = plain.update(mirror_batch(batch, rows)), mirrored.update(batch)
+        np.testing.assert_array_equal(got.errors, expected.errors)
+    for name, array in mirrored.weights().items():
+        np.testing.assert_array_equal(array, plain.weights()[name])

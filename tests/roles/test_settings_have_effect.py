@@ -286,6 +286,7 @@ CASES: dict[str, tuple[Measure, str]] = {
     "learner.weights_period": (broadcast, "3"),
     "learner.precision": (learned, "bfloat16"),
     "learner.prefetch": (requested, "2"),
+    "learner.mirror": (learned, "false"),
     "exploration.kind": (flown, "anneal"),
     "exploration.base": (explored, "0.2"),
     "exploration.alpha": (explored, "3.0"),

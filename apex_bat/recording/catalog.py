@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from apex_bat.recording.probing import undecodable
 from apex_bat.recording.reading import RecordingError, read_properties
 from apex_bat.recording.training import TRAINING_RECORDING
 
 Pose = tuple[float, float, float]
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,10 @@ def list_flights(run: Path, condition: str = "") -> list[Entry]:
     """
     folder = run / "recordings"
     paths = [path for path in (*folder.glob("*.rrd"), *folder.glob("*.rrd.part")) if path.name != TRAINING_RECORDING]
-    entries = [entry for path in paths if (entry := _entry(path)) is not None]
+    damaged = undecodable(paths)
+    for path in damaged:
+        _log.warning("%s: damaged so that nothing can read it; left out", path)
+    entries = [entry for path in paths if path not in damaged and (entry := _entry(path)) is not None]
     if not entries:
         raise RecordingError(f"{run}: no flight recordings; `apex-bat evaluate {run} --record 3` makes some")
     found = [entry for entry in entries if condition in ("", entry.condition)]
@@ -117,11 +124,14 @@ def _order(entry: Entry) -> tuple[bool, int, str, int, str]:
 
 
 def _entry(path: Path) -> Entry | None:
-    """The entry of a file; None for what is no flight recording, or not yet."""
+    """The entry of a file that can be decoded; None for what is no flight recording, or not yet."""
     try:
-        known = read_properties(path)
-    except RecordingError:
+        return _described(path, read_properties(path, is_tried=True))
+    except (RecordingError, KeyError, TypeError, ValueError):
         return None
+
+
+def _described(path: Path, known: Mapping[str, Any]) -> Entry:
     start = [float(known[name]) for name in ("start_x_m", "start_y_m", "start_heading_rad") if name in known]
     return Entry(
         path=path,

@@ -11,7 +11,8 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -27,10 +28,16 @@ from apex_bat.config.settings import Sonar as SonarSettings
 from apex_bat.experience import NUM_BINS
 from apex_bat.recording.columns import images_of, tensors_of
 from apex_bat.recording.flight import ACTION_NAMES, Flight, FlightFacts
+from apex_bat.recording.probing import undecodable
 from apex_bat.recording.series import EAR_NAMES, PROPERTIES_PATH, SERIES, SETTINGS_PATH
 from apex_bat.simulation.layout import Arena
 
 REPAIR_TIMEOUT_S = 120.0
+_LIES = (
+    AttributeError, IndexError, KeyError, MemoryError, OverflowError, TypeError, ValueError, pa.ArrowException,
+    msgspec.MsgspecError,
+)  # fmt: skip
+"""What content raises that could be decoded and is not what it should be."""
 
 
 class RecordedSettings(msgspec.Struct, frozen=True):
@@ -51,7 +58,11 @@ def read_flight(path: Path) -> Flight:
     Raises:
         RecordingError: names the file and what is wrong with it.
     """
-    chunks = _read_chunks(path)
+    with _told(path):
+        return _flight(path, _read_chunks(path))
+
+
+def _flight(path: Path, chunks: list[Chunk]) -> Flight:
     known = _properties(path, chunks)
     period = int(known["heavy_period_steps"])
     arrays = _arrays_of_steps(chunks)
@@ -78,16 +89,22 @@ def read_settings(path: Path) -> RecordedSettings:
     Raises:
         RecordingError: names the file and what is wrong with it.
     """
-    return _settings(path, _read_chunks(path))
+    with _told(path):
+        return _settings(path, _read_chunks(path))
 
 
-def read_properties(path: Path) -> Mapping[str, Any]:
+def read_properties(path: Path, *, is_tried: bool = False) -> Mapping[str, Any]:
     """Returns what a recording says of the flight as a whole, without reading the rest where it has an index.
+
+    Args:
+        path: the recording.
+        is_tried: whether `probing.undecodable` was asked about it.
 
     Raises:
         RecordingError: names the file and what is wrong with it.
     """
-    return _properties(path, _read_chunks(path, "/__properties/**"))
+    with _told(path):
+        return _properties(path, _read_chunks(path, "/__properties/**", is_tried=is_tried))
 
 
 def read_chunks(path: Path) -> list[Chunk]:
@@ -117,15 +134,34 @@ def repair_recording(path: Path, repaired: Path) -> None:
         RecordingError: nothing in the file can be read.
     """
     command = [sys.executable, "-m", "rerun_cli", "rrd", "optimize", str(path), "-o", str(repaired)]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=REPAIR_TIMEOUT_S, check=False)  # noqa: S603
+    try:
+        run = subprocess.run(  # noqa: S603  # our own command
+            command, capture_output=True, text=True, errors="replace", timeout=REPAIR_TIMEOUT_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise RecordingError(f"{path}: cannot be repaired within {REPAIR_TIMEOUT_S:g} s") from None
     if run.returncode != 0 or not repaired.is_file():
-        raise RecordingError(f"{path}: cannot be repaired: {run.stderr.strip().splitlines()[-1:]}")
+        reason = next((line for line in reversed(run.stderr.splitlines()) if line.startswith("Error")), "damaged")
+        raise RecordingError(f"{path}: cannot be repaired: {reason}")
 
 
-def _read_chunks(path: Path, content: str | None = None) -> list[Chunk]:
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Makes one error of all that damaged content raises."""
+    try:
+        yield
+    except RecordingError:
+        raise
+    except _LIES as error:
+        raise RecordingError(f"{path}: damaged: {error}") from error
+
+
+def _read_chunks(path: Path, content: str | None = None, *, is_tried: bool = False) -> list[Chunk]:
     """The chunks of some entities, in the order in which they were written, repaired first where needed."""
     if not path.is_file():
         raise RecordingError(f"{path}: no such recording")
+    if not is_tried and undecodable([path]):
+        raise RecordingError(f"{path}: damaged so that nothing can read it; move it out of its folder")
     try:
         try:
             return _stream(path, content)

@@ -15,7 +15,8 @@ from rerun.chunk import Chunk, LazyChunkStream
 from rerun.experimental import ViewerClient
 
 from apex_bat.recording.blueprints import PAIR
-from apex_bat.recording.reading import is_whole, read_chunks, repair_recording
+from apex_bat.recording.probing import undecodable
+from apex_bat.recording.reading import RecordingError, is_whole, read_chunks, repair_recording
 
 HOST = "127.0.0.1"
 LOAD_TIMEOUT_S = 300.0
@@ -58,8 +59,11 @@ def whole_copies(paths: Sequence[Path], folder: Path) -> list[Path]:
     """Returns the recordings, a repaired copy in the folder in place of each that was cut short.
 
     Raises:
-        RecordingError: one cannot be repaired.
+        RecordingError: one cannot be repaired, or not even read.
     """
+    damaged = undecodable(paths)
+    if damaged:
+        raise RecordingError(f"{damaged[0]}: damaged so that nothing can read it; move it out of its folder")
     return [path if is_whole(path) else _repaired(path, folder) for path in paths]
 
 

@@ -26,6 +26,7 @@ MAX_JSON_BYTES = 1 << 26  # of run.json, status.json and the like, which have so
 MAX_UNPACKED_BYTES = 1 << 30  # of a compressed file of arrays: one kilobyte of it could claim a megabyte
 MAX_NPY_HEADER = 10_000  # characters, as numpy has it
 PLAIN_KINDS = "biufSU"  # booleans, numbers, text: no objects, which would be pickled, and no records
+UNFINISHED = ".part"  # end of the name of what is written beside; the name begins with a dot
 _HEADER, _DATA = "header.json", "data/"
 _NPZ_ERRORS = (
     OSError, ValueError, KeyError, TypeError, EOFError, OverflowError, RecursionError, RuntimeError, MemoryError,
@@ -91,7 +92,7 @@ def write_arrays(path: Path, kind: str, header: Mapping[str, Any], arrays: Mappi
     """
     text = json.dumps({"kind": kind, **header}, sort_keys=True)
     content = {_HEADER: np.frombuffer(text.encode(), np.uint8)} | {_DATA + name: a for name, a in arrays.items()}
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    beside = beside_of(path)
     try:
         with beside.open("wb") as file:
             np.savez(file, allow_pickle=False, **content)
@@ -184,7 +185,7 @@ def write_text(path: Path, text: str, mode: int = 0o666) -> None:
     Raises:
         StorageError: it cannot be written.
     """
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    beside = beside_of(path)
     try:
         descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode)
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:
@@ -196,6 +197,17 @@ def write_text(path: Path, text: str, mode: int = 0o666) -> None:
         raise StorageError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
         beside.unlink(missing_ok=True)
+
+
+def beside_of(path: Path) -> Path:
+    """Returns where this process writes a file or folder before it takes its name."""
+    return path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")
+
+
+def writer_of(path: Path) -> int | None:
+    """Returns the process that a file which `beside_of` named was written by; None if the name does not tell."""
+    number = path.name.removesuffix(UNFINISHED).rpartition(".")[2]
+    return int(number) if number.isdecimal() else None
 
 
 def sync_folder(folder: Path) -> None:

@@ -46,10 +46,7 @@ def _measure(batch_size: int, name: str) -> list[Record]:
     with ServerProcess(None, batch_size) as server:
         _fill(server.address)
         reader = ReplayReader(server.address, batch_size, PREFETCH)
-        batches = [batch for _ in range(IN_MEMORY) if (batch := reader.next(10.0)) is not None]
-        if len(batches) < IN_MEMORY:
-            raise RuntimeError(f"the server gave {len(batches)} batches within 10 s each: {reader.waiting}")
-        turn = cycle(batches)
+        turn = cycle(_some(reader, IN_MEMORY))
         for _ in range(ROUNDS):
             in_memory.append(_updates_per_s(agent, lambda: next(turn), None))
             waited_s = reader.waited_s
@@ -63,6 +60,24 @@ def _measure(batch_size: int, name: str) -> list[Record]:
         summary(f"{name}.relative_updates", "1", relative),
         summary(f"{name}.idle_share", "1", idle),
     ]
+
+
+def batches_in_memory(batch_size: int, number: int) -> list[Batch]:
+    """Returns batches of synthetic transitions, from a server."""
+    with ServerProcess(None, batch_size) as server:
+        _fill(server.address)
+        reader = ReplayReader(server.address, batch_size, PREFETCH)
+        try:
+            return _some(reader, number)
+        finally:
+            reader.close()
+
+
+def _some(reader: ReplayReader, number: int) -> list[Batch]:
+    batches = [batch for _ in range(number) if (batch := reader.next(10.0)) is not None]
+    if len(batches) < number:
+        raise RuntimeError(f"the server gave {len(batches)} batches within 10 s each: {reader.waiting}")
+    return batches
 
 
 def _fill(address: str) -> None:

@@ -57,7 +57,7 @@ def _measure(num_actors: int) -> list[Record]:
             "--set", "evaluation.during_training=false", "--set", "evaluation.arenas=[]",
         ]  # fmt: skip
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=os.environ)
-        rows = {path.stem: _rows(path) for path in (run / "metrics").glob("*.jsonl")}
+        rows = {path.stem: read_rows(path, SETTLED_S) for path in (run / "metrics").glob("*.jsonl")}
     name = f"system.actors_{num_actors}"
     steps = [
         sum(rates)
@@ -73,9 +73,10 @@ def _measure(num_actors: int) -> list[Record]:
     ]
 
 
-def _rows(path: Path) -> list[dict[str, Any]]:
+def read_rows(path: Path, settled_s: float) -> list[dict[str, Any]]:
+    """Returns a file's rows from when the run had flown for some time."""
     rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    return [row for row in rows if row["elapsed_s"] >= SETTLED_S]
+    return [row for row in rows if row["elapsed_s"] >= settled_s]
 
 
 def _series(rows: list[dict[str, Any]], name: str) -> list[float]:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import psutil
 
 from apex_bat.config.settings import Config, Learner, Replay
 from apex_bat.replay.client import ReplayReader, ReplayWriter
@@ -112,6 +113,11 @@ class ServerProcess:
         self.stop.set()
         return self._figures.get(timeout=60)
 
+    def cpu_s(self) -> float:
+        """Returns the CPU time that the server has used so far."""
+        times = psutil.Process(self._process.pid).cpu_times()
+        return float(times.user + times.system)
+
     def __enter__(self) -> ServerProcess:
         return self
 
@@ -160,7 +166,7 @@ def _saturated(name: str, num_actors: int, batch_size: int, keys: Keys | None) -
                 client.join(10)
         inserted.append(rates["replay.inserted"])
         batches.append(rates["replay.sampled"] / batch_size)
-    insert_mb, batch_mb = _message_mb(batch_size)
+    insert_mb, batch_mb = message_mb(batch_size)
     moved_mb = [rows * insert_mb + drawn * batch_mb for rows, drawn in zip(inserted, batches, strict=True)]
     return [
         summary(f"{name}.inserted_per_s", "1/s", inserted),
@@ -169,7 +175,7 @@ def _saturated(name: str, num_actors: int, batch_size: int, keys: Keys | None) -
     ]
 
 
-def _message_mb(batch_size: int) -> tuple[float, float]:
+def message_mb(batch_size: int) -> tuple[float, float]:
     """Returns what an inserted transition and a batch take on the wire, in MB of 1e6 bytes."""
     chunks = [synthetic_chunk(np.random.default_rng(0))] * CHUNKS_AT_ONCE
     store = ReplayStore(_settings(2_000, batch_size), np.random.default_rng(0))

@@ -75,6 +75,7 @@ def _report(error: Exception) -> int:
     known = {
         "ArenaError": 2,
         "TransportError": 1,
+        "ClusterError": 1,
         "RunError": 1,
         "InUseError": 1,
         "RecordingError": 1,
@@ -90,7 +91,8 @@ def _report(error: Exception) -> int:
     if isinstance(error, OSError) and error.filename:
         return _line(OSError(f"{error.filename}: {error.strerror}"), 1)
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("apex_bat"):
-        print(f"apex-bat: {error.name} is not installed; pip install 'apex-bat[train]' brings it", file=sys.stderr)
+        extra = "cluster" if error.name == "ray" else "train"
+        print(f"apex-bat: {error.name} is not installed; pip install 'apex-bat[{extra}]' brings it", file=sys.stderr)
         return 1
     raise error
 

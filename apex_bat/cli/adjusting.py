@@ -25,7 +25,7 @@ def adjust(
     from apex_bat.roles.plan import read_addresses
     from apex_bat.roles.process import ADDRESSES
     from apex_bat.storage import read_json
-    from apex_bat.transport.messages import RatioChange
+    from apex_bat.transport.messages import Ratio, RatioChange
     from apex_bat.transport.security import load_keys
 
     if not 0.0 < samples_per_insert <= 1e6 or (error_buffer is not None and not 0.0 <= error_buffer <= 1e12):
@@ -33,11 +33,14 @@ def adjust(
     config = runs.load_config(run)
     addresses = read_addresses(run / ADDRESSES)
     keys = load_keys(Path(config.transport.keys)) if config.transport.keys else None
-    change = RatioChange(samples_per_insert, error_buffer)
+    shards = config.replay.shards
+    change = RatioChange(samples_per_insert, None if error_buffer is None else error_buffer / shards)
     try:
-        now = change_ratio(addresses.replay, change, generation=addresses.replay_generation, keys=keys)
+        for address, generation in zip(addresses.replays, addresses.replay_generations, strict=True):
+            now = change_ratio(address, change, generation=generation, keys=keys)
     except ValueError as error:
         raise ConfigError(str(error)) from None
+    now = Ratio(now.samples_per_insert, shards * now.error_buffer)
     moment = datetime.now(UTC).isoformat(timespec="seconds")
     entry = {"time": moment, "samples_per_insert": now.samples_per_insert, "error_buffer": now.error_buffer}
     runs.note(run, adjusted=[*read_json(run / "run.json").get("adjusted", []), entry])

@@ -107,7 +107,10 @@ def arena(
 
 def bench(
     part: Annotated[
-        str, typer.Argument(help="What to measure: simulation, replay, wire, recording, learner, system, or all.")
+        str,
+        typer.Argument(
+            help="What to measure: simulation, replay, wire, recording, learner, system, scaling, or all but scaling."
+        ),
     ],
     json_file: Json = None,
 ) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,8 +16,8 @@ from rich.console import Console
 from apex_bat.config import Config, ConfigError, load
 
 if TYPE_CHECKING:  # `--help` needs none of it
+    from apex_bat.launching.course import Ended
     from apex_bat.launching.live import View
-    from apex_bat.launching.local import Ended
     from apex_bat.launching.standing import Origin
 
 _BYTES_A_TRANSITION = 1024  # on the wire, at most: a chunk of one transition brings four frames of 192 bytes along
@@ -49,6 +49,10 @@ def train(
         bool, typer.Option("--rerun", help="Stream flights and curves to a rerun viewer that is open on this machine.")
     ] = False,
     plain: Annotated[bool, typer.Option("--plain", help="Plain lines instead of the live view.")] = False,
+    cluster: Annotated[
+        str | None,
+        typer.Option("--cluster", metavar="ADDRESS", help="Train on a running Ray cluster: `auto`, or HOST:PORT."),
+    ] = None,
 ) -> int:
     """Train on this machine: actors, replay, learner and evaluator as processes; then evaluate the best checkpoint.
 
@@ -64,10 +68,12 @@ def train(
         raise typer.BadParameter("--run makes a new run and --resume goes on with one: give one of them")
     if without_replay and resume is None:
         raise typer.BadParameter("--without-replay belongs to --resume")
+    if cluster is not None and serial:
+        raise typer.BadParameter("--serial runs all roles in this process and --cluster on many: give one of them")
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     console = Console()
     if resume is None:
-        folder, config = _create(config_file, overrides or (), run, serial=serial)
+        folder, config = _create(config_file, overrides or (), run, serial=serial, cluster=cluster)
     else:
         folder, config = resume, _settings_of(resume)
     with locked_run(folder, config) as lock:
@@ -77,7 +83,7 @@ def train(
             from apex_bat.launching import resuming
 
             found = resuming.prepare(folder, config_file, overrides or (), serial=serial, without_replay=without_replay)
-            check(found.config, serial=found.mode == "serial")
+            check(found.config, serial=found.mode == "serial", on_cluster=cluster is not None)
             resuming.apply(folder, found, without_replay=without_replay)
             config, serial, lines, origin = found.config, found.mode == "serial", found.lines, found.origin
             part = resuming.num_resumed(folder)
@@ -85,7 +91,7 @@ def train(
         title = f"apex-bat train: {config.condition} in {config.arena}, seed {config.seed}{mode}, {folder}"
         for line in (title, *lines):
             console.print(line, highlight=False, soft_wrap=True)
-        start = _starter(config, folder, serial=serial, origin=origin, part=part, lock=lock)
+        start = _starter(config, folder, serial=serial, origin=origin, part=part, lock=lock, cluster=cluster)
         if follow(start, folder, title, console, rerun=rerun, plain=plain).outcome == "interrupted":
             typer.echo(
                 f"interrupted; the last checkpoint is in {folder / 'checkpoints'}; "
@@ -93,18 +99,24 @@ def train(
                 err=True,
             )
             raise typer.Exit(130)
-    conclude(folder, config, console)
+        conclude(folder, config, console)
     return 0
 
 
 def _create(
-    config_file: Path | None, overrides: Sequence[str], run: Path | None, *, serial: bool
+    config_file: Path | None, overrides: Sequence[str], run: Path | None, *, serial: bool, cluster: str | None
 ) -> tuple[Path, Config]:
     """Makes a new run folder; returns it with its settings."""
     from apex_bat.evaluation import runs
 
-    config = load(config_file, overrides)
-    check(config, serial=serial)
+    if cluster is None:
+        config = load(config_file, overrides)
+    else:
+        from apex_bat.launching import ray_cluster
+
+        with ray_cluster.connected(cluster):  # before a folder is made that nothing would run in
+            config = load(config_file, overrides, ray_cluster.num_actor_places)
+    check(config, serial=serial, on_cluster=cluster is not None)
     folder = run or Path("runs") / f"{config_file.stem if config_file else 'default'}-{datetime.now():%Y%m%d-%H%M%S}"
     runs.create(folder, config, mode="serial" if serial else "asynchronous")
     return folder, config
@@ -128,17 +140,37 @@ def locked_run(folder: Path, config: Config) -> AbstractContextManager[int | Non
 
 
 def _starter(
-    config: Config, folder: Path, *, serial: bool, origin: Origin | None, part: int, lock: int | None
+    config: Config,
+    folder: Path,
+    *,
+    serial: bool,
+    origin: Origin | None,
+    part: int,
+    lock: int | None,
+    cluster: str | None,
 ) -> Callable[[View], Ended]:
-    """Returns what trains under a view."""
-    if serial:
-        from apex_bat.launching import serial as mode
+    """Returns what trains under a view. Imports nothing yet: a Ctrl-C meanwhile is to be noted as one."""
 
-        return lambda view: mode.train(config, folder, view, is_resumed=origin is not None)
-    from apex_bat.launching import local
-    from apex_bat.launching.standing import NEW_RUN
+    def start(view: View) -> Ended:
+        from apex_bat.launching.space import warn_if_short
 
-    return lambda view: local.train(config, folder, view, origin=origin or NEW_RUN, part=part, lock=lock)
+        warn_if_short(config, folder)
+        if serial:
+            from apex_bat.launching import serial as mode
+
+            return mode.train(config, folder, view, is_resumed=origin is not None)
+        from apex_bat.launching.standing import NEW_RUN
+
+        if cluster is not None:
+            from apex_bat.launching import ray_cluster
+
+            with ray_cluster.connected(cluster):
+                return ray_cluster.train(config, folder, view, origin=origin or NEW_RUN, part=part)
+        from apex_bat.launching import local
+
+        return local.train(config, folder, view, origin=origin or NEW_RUN, part=part, lock=lock)
+
+    return start
 
 
 def follow(
@@ -155,13 +187,15 @@ def follow(
         plain: whether to print plain lines instead of the live view.
     """
     from apex_bat.evaluation import runs
-    from apex_bat.launching.live import PlainView, view_for
     from apex_bat.storage import StorageError
 
-    view = PlainView(console) if plain else view_for(console, title)
     try:
-        with _streamer(folder) if rerun else nullcontext():
-            ended = start(view)
+        with _without_leftovers(folder), _streamer(folder) if rerun else nullcontext():
+            ended = start(_view(title, console, plain=plain))
+    except KeyboardInterrupt:  # while it began; one that comes later ends what `start` follows
+        with suppress(StorageError):
+            runs.finish(folder, "interrupted", reason="interrupted")
+        raise
     except BaseException as error:
         with suppress(StorageError):  # of a full disk, which is then the error at hand
             runs.finish(folder, "failed", reason=str(error) or type(error).__name__)
@@ -177,19 +211,38 @@ def follow(
     return ended
 
 
+def _view(title: str, console: Console, *, plain: bool) -> View:
+    from apex_bat.launching.live import PlainView, view_for
+
+    return PlainView(console) if plain else view_for(console, title)
+
+
+@contextmanager
+def _without_leftovers(folder: Path) -> Iterator[None]:
+    """Removes what killed processes were writing in a run folder, before the block and after it."""
+    from apex_bat.launching.leftovers import remove_leftovers
+
+    remove_leftovers(folder)
+    try:
+        yield
+    finally:
+        remove_leftovers(folder)
+
+
 def _streamer(folder: Path) -> AbstractContextManager[None]:
     from apex_bat.recording.streaming import streamer
 
     return streamer(folder)
 
 
-def check(config: Config, *, serial: bool = False) -> None:
+def check(config: Config, *, serial: bool = False, on_cluster: bool = False) -> None:
     """Refuses settings that no role could work with, before anything is started.
 
     Raises:
         ConfigError, ArenaError, TransportError: they name the setting.
     """
     from apex_bat.agent.inference import parameter_shapes
+    from apex_bat.replay.store import limiter_of
     from apex_bat.simulation.arenas import load_arenas
     from apex_bat.transport.security import load_keys
     from apex_bat.transport.sockets import check_address
@@ -198,10 +251,13 @@ def check(config: Config, *, serial: bool = False) -> None:
         from apex_bat.launching.serial import settings_of
 
         settings_of(config)
-    if config.replay.shards > 1:
-        raise ConfigError(
-            f"replay.shards is {config.replay.shards}, and training starts one replay server: set it to 1"
-        )
+    if config.replay.shards > 1 and (serial or on_cluster):
+        mode = "a serial run" if serial else "a run on a cluster"
+        raise ConfigError(f"replay.shards is {config.replay.shards}, and {mode} has one replay: set it to 1")
+    try:
+        limiter_of(config)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
     _check_inserts(config)
     for arena in dict.fromkeys((config.arena, *config.evaluation.arenas)):
         load_arenas(arena)
@@ -210,6 +266,8 @@ def check(config: Config, *, serial: bool = False) -> None:
     except ValueError as error:
         raise ConfigError(str(error)) from None
     keys = load_keys(Path(config.transport.keys)) if config.transport.keys else None
+    if on_cluster and config.transport.host != "ipc":
+        raise ConfigError("transport.host: on a cluster each role listens at its node's address; leave it out")
     if config.transport.host != "ipc":
         check_address(f"tcp://{config.transport.host}:{config.transport.base_port}", keys)
 

@@ -123,7 +123,8 @@ class Replay(Section, frozen=True):
     snapshot_period_s: NonNegative = 60.0
     """Seconds between snapshots of the replay; 0: only at the end."""
     shards: Annotated[int, Meta(ge=1, le=64)] = 1
-    """Replay servers that share the transitions."""
+    """Replay servers that share the transitions, each with its part of capacity, min_size and error_buffer. More than
+    one pays when one server's core or memory is full: docs/scaling.md."""
 
     def __post_init__(self) -> None:
         if self.min_size > self.capacity:

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import difflib
+import os
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import tomli_w
 
-from apex_bat.config.settings import Config
+from apex_bat.config.settings import MOST_ACTORS, Config
 
 MAX_BYTES = 1 << 20  # of a TOML file: all settings take 10 KB, an arena of 60 walls 6 KB
+AUTO = "auto"
+"""As the number of `actors`: as many as there is room for."""
+OTHER_CORES = 2
+"""Of a machine, that `actors = "auto"` leaves to learner and replay."""
 _LONG_KEY = re.compile(rb"(?:[^\s=.,\[\]{}]+[ \t]*\.[ \t]*){100}")
 
 
@@ -22,13 +27,23 @@ class ConfigError(ValueError):
     """A setting that is unknown, of the wrong type, out of range or in contradiction with another."""
 
 
-def load(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
+def places_here(_config: Config) -> int:
+    """Returns how many actors `actors = "auto"` means on this machine: its cores less two, at least 1."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, cores - OTHER_CORES)
+
+
+def load(
+    path: Path | None = None, overrides: Sequence[str] = (), num_places: Callable[[Config], int] = places_here
+) -> Config:
     """Returns the settings of a TOML file, changed by overrides such as `replay.capacity=50000`.
 
     Args:
         path: the file; None: the defaults.
         overrides: `section.key=value` with the value in TOML's notation; a bare word is taken as a string, and `none`
             means None where that is allowed.
+        num_places: says how many actors `actors = "auto"` means for the other settings; it stands in the result, and
+            `cluster.grow` is then true.
 
     Raises:
         ConfigError: names the setting, what was given and what is allowed.
@@ -38,6 +53,10 @@ def load(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
         _apply(table, override)
     origin = f"{path}: " if path is not None else ""
     try:
+        if table.get("actors") == AUTO:
+            table["actors"] = MOST_ACTORS
+            table["cluster"] = {"grow": True, **table.get("cluster", {})}
+            table["actors"] = min(MOST_ACTORS, num_places(msgspec.convert(table, Config)))
         return msgspec.convert(table, Config)
     except msgspec.ValidationError as error:
         raise ConfigError(origin + _explain(str(error))) from None

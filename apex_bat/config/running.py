@@ -6,7 +6,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from apex_bat.config.sections import Count, CountOrZero, Positive, Section
+from apex_bat.config.sections import Count, CountOrZero, NonNegative, Positive, Section
 
 
 class Transport(Section, frozen=True):
@@ -115,3 +115,28 @@ class Launch(Section, frozen=True):
     """Size at which a log is renamed to NAME.log.1 and begun anew (POSIX; elsewhere logs grow)."""
     log_files: CountOrZero = 3
     """Former logs kept of each role; 0: none, and the log is emptied instead."""
+
+
+class Cluster(Section, frozen=True):
+    """Where Ray puts the roles of `train --cluster`, and how long they live without their launcher."""
+
+    role_cpus: Positive = 1.0
+    """CPUs set aside for each actor, for the replay and for the evaluator. The learner takes `train.threads`."""
+    learner_gpus: NonNegative | None = None
+    """GPUs set aside for the learner; None: one if the cluster has any and `device` is not cpu."""
+    replay_memory_gb: Positive | None = None
+    """Memory set aside for each replay server, of 1e9 bytes; None: 0.5 and 600 bytes for each transition that it holds
+    (280 measured, twice that while a snapshot is written)."""
+    learner_resource: str = ""
+    """Custom resource (`ray start --resources`) of which the learner takes 1, to be put where there is one."""
+    replay_resource: str = ""
+    """The same for the replay."""
+    actor_resource: str = ""
+    """The same for each actor."""
+    grow: bool = False
+    """Whether further actors are started when the cluster has room for more. `actors = "auto"` sets it."""
+    wait_s: Positive = 120.0
+    """How long to wait at the start for a place for replay, learner, evaluator and one actor; then the run fails."""
+    lease_s: Annotated[float, Meta(ge=2.0)] = 20.0
+    """A role whose host has not heard the launcher for so long is killed there, and replaced elsewhere afterwards: less
+    than the 65 s in which Ray notices a silent node, more than the pauses of a network that is well."""

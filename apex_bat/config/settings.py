@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from apex_bat.config.bat import Body, Episode, Rays, Sensing, Sonar
 from apex_bat.config.learning import Actor, Exploration, Learner, Network, Replay
-from apex_bat.config.running import Checkpoint, Evaluation, Launch, Recording, Train, Transport
+from apex_bat.config.running import Checkpoint, Cluster, Evaluation, Launch, Recording, Train, Transport
 from apex_bat.config.sections import Condition, CountOrZero, Section
 
 __all__ = [
@@ -35,7 +35,10 @@ __all__ = [
     "Evaluation",
     "Recording",
     "Launch",
+    "Cluster",
 ]
+
+MOST_ACTORS = 4096
 
 
 class Config(Section, frozen=True):
@@ -47,8 +50,8 @@ class Config(Section, frozen=True):
     """Name of a shipped arena, a file under configs/arenas, or a path to one."""
     condition: Condition = "memory"
     """What the bat may use: three echoes, the newest only, or only the onsets of them (thesis)."""
-    actors: Annotated[int, Meta(ge=1, le=4096)] = 2
-    """Actor processes."""
+    actors: Annotated[int, Meta(ge=1, le=MOST_ACTORS)] = 2
+    """Actor processes. `auto`: as many as this machine has cores, less two, or as the cluster has room for."""
     bats_per_actor: Annotated[int, Meta(ge=1, le=1024)] = 16
     """Bats that each actor flies in one world, in step."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -70,6 +73,7 @@ class Config(Section, frozen=True):
     evaluation: Evaluation = Evaluation()
     recording: Recording = Recording()
     launch: Launch = Launch()
+    cluster: Cluster = Cluster()
 
     def __post_init__(self) -> None:
         absent = [number for number in self.recording.actors if number >= self.actors]

@@ -117,7 +117,8 @@ def judge(folder: Path, protocol: Protocol) -> Judged:
     known = read_json(folder / "run.json") if (folder / "run.json").exists() else {}
     facts = runs.training_facts(folder, config) | {"checkpoint_step": result["learner_step"]}
     facts |= {name: known.get(name) for name in ("host", "platform", "reason", "resumed")}
-    facts["samples_per_insert"] = _last(folder, "replay", "replay.samples_per_insert")
+    first_replay = "replay" if config.replay.shards == 1 else "replay-0"
+    facts["samples_per_insert"] = _last(folder, first_replay, "replay.samples_per_insert")
     return Judged(folder.name, config.condition, config, records, traces, facts, read_curve(folder))
 
 

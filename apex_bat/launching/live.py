@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import math
 from contextlib import suppress
+from statistics import fmean
 from types import TracebackType
 from typing import Any, Protocol
 
@@ -153,7 +154,8 @@ def _curve_values(standing: Standing) -> tuple[float, ...]:
 
 def figures(standing: Standing) -> list[tuple[str, str]]:
     """Returns name and text of each figure of the view, a dash for what is not known yet."""
-    replay, learner = standing.roles["replay"], standing.roles["learner"]
+    replays = [role for name, role in standing.roles.items() if name.startswith("replay")]
+    learner = standing.roles["learner"]
     evaluator = standing.roles.get("evaluator")
     left_s = standing.time_left_s
     judged = math.nan if evaluator is None else evaluator.gauge("completed_share")
@@ -167,9 +169,9 @@ def figures(standing: Standing) -> list[tuple[str, str]]:
         ("greedy return", _number(standing.recent("return_greedy"), 2)),
         ("return", _number(standing.recent("return"), 2)),
         ("test flights", "-" if math.isnan(judged) else f"{100 * judged:.0f} % complete"),
-        ("replay", _number(replay.gauge("replay.size"))),
-        ("samples/insert", _number(replay.gauge("replay.samples_per_insert"), 2)),
-        ("policy lag", _number(replay.gauge("replay.policy_lag"), 0)),
+        ("replay", _number(sum(replay.gauge("replay.size") for replay in replays))),
+        ("samples/insert", _number(fmean(replay.gauge("replay.samples_per_insert") for replay in replays), 2)),
+        ("policy lag", _number(fmean(replay.gauge("replay.policy_lag") for replay in replays), 0)),
         ("elapsed", _clock(standing.elapsed_s)),
         ("time left", "-" if left_s is None else _clock(left_s)),
     ]

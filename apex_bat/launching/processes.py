@@ -13,7 +13,9 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from apex_bat.config import Config
 from apex_bat.launching import ONE_THREAD
+from apex_bat.launching.leftovers import is_needed
 from apex_bat.launching.supervisor import Exit
 from apex_bat.roles.plan import Role
 
@@ -32,6 +34,9 @@ class RoleProcess:
         num_threads: int,
         flown_steps: int = 0,
         lock: int | None = None,
+        *,
+        orders: bytes | None = None,
+        folder: Path | None = None,
     ) -> None:
         """Starts it; its output is appended to `logs/NAME.log`.
 
@@ -42,6 +47,8 @@ class RoleProcess:
             num_threads: of numpy's linear algebra and of torch.
             flown_steps: environment steps of the whole run so far.
             lock: file descriptor of the run's lock, which the process keeps open as long as it lives.
+            orders: the line that tells it addresses and keys, see `roles.orders`; None: it reads addresses.json.
+            folder: to work in, where paths of the settings are relative to; None: that of this process.
 
         Raises:
             OSError: it cannot be started.
@@ -50,20 +57,35 @@ class RoleProcess:
         self._log = run / "logs" / f"{role.name}.log"
         command = [sys.executable, "-m", "apex_bat", role.kind, "--run", str(run), "--leash",
                    "--number", str(role.number), "--incarnation", str(incarnation),
-                   "--flown", str(flown_steps)]  # fmt: skip
+                   "--flown", str(flown_steps), *(("--orders",) if orders is not None else ())]  # fmt: skip
         environment = os.environ | dict.fromkeys(ONE_THREAD, str(num_threads))
         flags = 0 if os.name == "posix" else subprocess.CREATE_NEW_PROCESS_GROUP  # type: ignore[attr-defined]
         with self._log.open("ab") as output:
             self._process = subprocess.Popen(  # noqa: S603  # our own command
                 command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=environment,
                 start_new_session=os.name == "posix", creationflags=flags,
-                pass_fds=() if lock is None else (lock,),
+                pass_fds=() if lock is None else (lock,), cwd=folder,
             )  # fmt: skip
+        if orders is not None:
+            self.tell(orders)
 
     @property
     def pid(self) -> int:
         """Number of the process."""
         return self._process.pid
+
+    @property
+    def waiting(self) -> str:
+        """Nothing: it has its process."""
+        return ""
+
+    def tell(self, orders: bytes) -> None:
+        """Writes a line of orders to a role that takes them; one that has ended does not hear it."""
+        pipe = self._process.stdin
+        with suppress(BrokenPipeError, ValueError):  # closed by either end
+            if pipe is not None:
+                pipe.write(orders)
+                pipe.flush()
 
     def poll(self) -> Exit | None:
         """Returns how it ended, with the last line of its log, or None while it runs."""
@@ -87,13 +109,23 @@ class RoleProcess:
             remove_unfinished(self._run, self._role, self.pid)
 
 
+def threads_of(role: Role, config: Config) -> int:
+    """Returns how many threads a role may use for linear algebra."""
+    return config.train.threads if role.kind == "learner" else 1
+
+
 def remove_unfinished(run: Path, role: Role, pid: int) -> None:
-    """Removes the files that a process was writing when it ended. No recordings: those can be opened and repaired."""
+    """Removes the files that a process was writing when it ended, but none that is whole and only lacks its name.
+
+    No recordings: those can be opened and repaired.
+    """
     patterns = [f"checkpoints/.*.{pid}.part"]
-    patterns += {"replay": ["replay/*.writing"], "evaluator": ["checkpoints/.best.part"]}.get(role.kind, [])
+    own = {"replay": [f"replay/{role.name}.snapshot.writing"], "evaluator": ["checkpoints/.best.part"]}
+    patterns += own.get(role.kind, [])
     for path in (path for pattern in patterns for path in run.glob(pattern)):
-        with suppress(OSError):
-            path.unlink()
+        if not is_needed(path):
+            with suppress(OSError):
+                path.unlink()
 
 
 def last_line(path: Path, tail_bytes: int = 8192) -> str:

@@ -23,7 +23,8 @@ from apex_bat.replay.snapshot import SnapshotError, previous_of
 from apex_bat.replay.store import ReplayStore
 from apex_bat.replay.verification import SnapshotFacts, verify
 from apex_bat.roles import checkpoint
-from apex_bat.roles.replay import SNAPSHOT
+from apex_bat.roles.plan import roles_of
+from apex_bat.roles.replay import snapshot_of
 from apex_bat.storage import StorageError, digest, read_json, write_text
 
 Mode = Literal["asynchronous", "serial"]
@@ -110,10 +111,10 @@ def apply(run: Path, found: Continuation, *, without_replay: bool) -> None:
             write_text(run / f"config.toml.{num_resumed(run) + 1}", former)
             write_text(settings, text)
         if without_replay:
-            newest = run / "replay" / SNAPSHOT
-            for path in (newest, previous_of(newest)):
-                if path.exists():
-                    path.replace(path.with_name(path.name + ".set-aside"))
+            for newest in _snapshots_of(run, found.config).values():
+                for path in (newest, previous_of(newest)):
+                    if path.exists():
+                        path.replace(path.with_name(path.name + ".set-aside"))
     except OSError as error:
         raise StorageError(f"{run}: cannot be written: {error.strerror or error}") from None
     entry = {"start": datetime.now(UTC).isoformat(timespec="seconds"), **found.facts}
@@ -143,10 +144,11 @@ def _asynchronous(run: Path, config: Config, *, without_replay: bool) -> Continu
     if found.fingerprint != checkpoint.fingerprint(config):
         raise StorageError(f"{run / 'checkpoints'}: the newest checkpoint is of another network, sensing or condition")
     origin = _origin(run)._replace(updates=float(found.learner_step))
-    replay = None if without_replay else _snapshot(run, config)
-    hashes = _hashes_of(found.arrays) | ({} if replay is None else {"replay": replay.sha256})
-    transitions = 0 if replay is None else replay.transitions
-    return _continuation(config, "asynchronous", origin, transitions, hashes, replay)
+    paths = {} if without_replay else _snapshots_of(run, config)
+    replays = {name: _snapshot(path, config) for name, path in paths.items()}
+    hashes = _hashes_of(found.arrays) | {name: replay.sha256 for name, replay in replays.items()}
+    transitions = sum(replay.transitions for replay in replays.values())
+    return _continuation(config, "asynchronous", origin, transitions, hashes, [*replays.values()])
 
 
 def _serial(run: Path, config: Config) -> Continuation:
@@ -165,11 +167,11 @@ def _serial(run: Path, config: Config) -> Continuation:
     origin = Origin(env_steps, 0.0, updates, float(own["wall_elapsed_s"]))
     replay = verify(saved.replay)
     hashes = _hashes_of(learner) | ({} if replay is None else {"replay": replay.sha256})
-    return _continuation(config, "serial", origin, len(store.buffer), hashes, replay)
+    return _continuation(config, "serial", origin, len(store.buffer), hashes, [] if replay is None else [replay])
 
 
 def _continuation(
-    config: Config, mode: Mode, origin: Origin, transitions: int, hashes: dict[str, str], replay: SnapshotFacts | None
+    config: Config, mode: Mode, origin: Origin, transitions: int, hashes: dict[str, str], replays: list[SnapshotFacts]
 ) -> Continuation:
     facts = {
         "mode": mode,
@@ -184,16 +186,20 @@ def _continuation(
         f"{origin.elapsed_s / 60.0:.1f} minutes flown, {transitions:,} transitions",
         "SHA-256: " + ", ".join(f"{name} {value[:SHORT]}" for name, value in hashes.items()),
     ]
-    if replay is None:
+    if not replays:
         lines.append("the replay begins empty")
-    elif replay.refused:
-        lines.append(f"an older snapshot is used: {replay.refused}")
+    lines += [f"an older snapshot is used: {replay.refused}" for replay in replays if replay.refused]
     return Continuation(config, mode, origin, facts, tuple(lines))
 
 
-def _snapshot(run: Path, config: Config) -> SnapshotFacts:
-    """Returns the facts of the snapshot that the replay will restore."""
-    path, way_on = run / "replay" / SNAPSHOT, "--without-replay resumes with an empty replay"
+def _snapshots_of(run: Path, config: Config) -> dict[str, Path]:
+    """Returns where the snapshots of a run's replay servers lie, by their names."""
+    return {role.name: snapshot_of(run, role) for role in roles_of(config) if role.kind == "replay"}
+
+
+def _snapshot(path: Path, config: Config) -> SnapshotFacts:
+    """Returns the facts of the snapshot that a replay server will restore."""
+    way_on = "--without-replay resumes with an empty replay"
     try:
         replay = verify(path)
     except SnapshotError as error:

@@ -3,7 +3,8 @@
 A turn is: the evaluator looks, the learner makes the updates that inserts have earned, one actor takes one step. Time
 is simulated: a step of all actors takes `body.call_interval_s`, so that periods in seconds depend on nothing outside.
 Only limits by the wall clock and the live view look at it. After a stop at any moment the run continues from its last
-saved state, and all that follows is what would have followed.
+saved state, and all that follows is what would have followed. What a full disk does not take is left out, as in a run
+of processes; what is learned does not change with it.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from types import FrameType
 from msgspec import structs
 
 from apex_bat.config import Config, ConfigError
+from apex_bat.launching.course import Ended, Outcome
 from apex_bat.launching.live import View
-from apex_bat.launching.local import Ended, Outcome, heeded
+from apex_bat.launching.local import heeded
 from apex_bat.launching.serial_reports import SerialReports
 from apex_bat.launching.serial_state import SavedRun, put_back, read_newest, write
 from apex_bat.launching.standing import Origin
@@ -48,7 +50,7 @@ def train(config: Config, run: Path, view: View, *, is_resumed: bool = False) ->
 
     Raises:
         ConfigError: the settings ask for what has no equal bits.
-        StorageError: there is no sound state to go on from, or the disk is full.
+        StorageError: there is no sound state to go on from, or the disk is full when it begins.
     """
     stop = threading.Event()
     with _stopping(stop), launcher_log(run, config.launch), ExitStack() as stack:
@@ -76,6 +78,7 @@ class SerialRun:
     ) -> None:
         """Makes the roles, which `stack` closes; arguments and errors are those of `train`."""
         self._config, self._run, self._stop = config, run, stop
+        self._view: View | None = None
         self._num_turns = 0
         self._has_looked = False  # whether the evaluator has had its part of this turn
         replay = self._assignment(Role("replay", 0))
@@ -106,7 +109,7 @@ class SerialRun:
         self._evaluator: Evaluator | None = None
         if config.evaluation.during_training:
             evaluator = self._assignment(Role("evaluator", 0))
-            self._evaluator = Evaluator(evaluator, self._reporter(evaluator))
+            self._evaluator = Evaluator(evaluator, self._reporter(evaluator), self._show)
         if saved is not None:
             self._restore(saved)
         self._save_due_s = self.now_s() + (config.replay.snapshot_period_s or float("inf"))
@@ -128,10 +131,11 @@ class SerialRun:
     def follow(self, view: View) -> Ended:
         """Goes on until a limit or Ctrl-C."""
         outcome: Outcome = "completed"
+        self._view = view
         try:
             while not self._is_over():
                 self.turn()
-                self._reports.show(view)
+                self._show()
                 if self._stop.is_set():
                     outcome = "interrupted"
                     break
@@ -161,6 +165,11 @@ class SerialRun:
         actor.step()
         if self._replay_reporter.is_due:
             self._report_replay("serving")
+
+    def _show(self) -> None:
+        """Shows how the run stands, also within the long part of a turn, its evaluation."""
+        if self._view is not None:
+            self._reports.show(self._view)
 
     def _is_over(self) -> bool:
         """Whether a limit is reached."""

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import socket
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -16,20 +13,18 @@ from msgspec import structs
 
 from apex_bat.config import Config
 from apex_bat.launching.live import View
+from apex_bat.launching.lost_writes import LostWrites
 from apex_bat.launching.rows import RowThinner
 from apex_bat.launching.standing import Origin, Standing
-from apex_bat.launching.status import STATUS
+from apex_bat.launching.status_file import STATUS_PERIOD_S, StatusFile
 from apex_bat.launching.supervisor import Exit, Watched
 from apex_bat.recording.event_file import EventFile
 from apex_bat.recording.metrics import MetricsWriter
 from apex_bat.recording.training import TrainingRecording
 from apex_bat.roles.plan import roles_of
-from apex_bat.roles.resources import began_unix_s, own_resources
-from apex_bat.storage import StorageError, write_text
 from apex_bat.transport.messages import Report
 
 VIEW_PERIOD_S = 0.25
-STATUS_PERIOD_S = 1.0
 
 
 class SerialReports:
@@ -51,7 +46,7 @@ class SerialReports:
         counters: Callable[[], tuple[int, int]],
         origin: Origin,
     ) -> None:
-        self._run, self._clock, self._counters = run, clock, counters
+        self._clock, self._counters = clock, counters
         self.thinner = RowThinner(config.launch.dense_rows_s)
         self._standing = Standing(config, time.monotonic(), origin)
         self._watched = {role.name: Watched(role) for role in roles_of(config)}
@@ -60,7 +55,7 @@ class SerialReports:
         training = TrainingRecording(config, run) if config.recording.curves else None
         self._metrics = MetricsWriter(run / "metrics", training, clock, partial(EventFile, clock=clock))
         self._sent: dict[str, tuple[float, float]] = {}
-        self._began_unix_s = began_unix_s(os.getpid())
+        self._status, self._lost_writes = StatusFile(run), LostWrites()
         self._view_due_s = self._status_due_s = -math.inf
 
     @property
@@ -75,11 +70,7 @@ class SerialReports:
         return limit is not None and self.wall_elapsed_s >= 60.0 * limit
 
     def send(self, report: Report) -> None:
-        """Takes a report.
-
-        Raises:
-            StorageError: the disk is full.
-        """
+        """Takes a report. A row that the disk does not take is left out."""
         finite = {name: value for name, value in report.metrics.items() if math.isfinite(value)}
         report = structs.replace(report, metrics=finite)
         self._standing.take(self._in_wall_time(report), time.monotonic())
@@ -113,7 +104,8 @@ class SerialReports:
         # In the order of names: what was restored has another order than what was never saved.
         row = structs.replace(row, metrics=dict(sorted(row.metrics.items())))
         env_steps, learner_step = self._counters()
-        self._metrics.append(row, self._clock(), float(env_steps), float(learner_step))
+        with self._lost_writes.borne():
+            self._metrics.append(row, self._clock(), float(env_steps), float(learner_step))
 
     def _in_wall_time(self, report: Report) -> Report:
         """Returns a report whose rates are those that a person watches."""
@@ -125,20 +117,15 @@ class SerialReports:
         return structs.replace(report, metrics=report.metrics | rates)
 
     def _write_status(self, *, ended: bool) -> None:
-        content = {
-            "launcher_pid": os.getpid(), "launcher_began_unix_s": self._began_unix_s, "host": socket.gethostname(),
-            "written_unix_s": time.time(), "ended": ended, "stall": "", "launcher_metrics": own_resources(),
-            "refused_reports": {}, "progress": self._standing.progress(),
-            "roles": self._standing.status(self._watched),
-        }  # fmt: skip
-        with suppress(StorageError):  # the metrics will say that the disk is full
-            write_text(self._run / STATUS, json.dumps(content, indent=1))
+        with self._lost_writes.borne():
+            self._status.write(self._standing, self._watched, has_ended=ended)
 
 
 class _ThisProcess:
     """What the view and the status know of a role that runs here."""
 
     pid = os.getpid()
+    waiting = ""
 
     def poll(self) -> Exit | None:
         """Returns None: it runs."""

@@ -1,8 +1,9 @@
 """The saved states of a serial run: everything at one moment as one folder, whole or absent.
 
 `serial/turn-N/` holds `state.npz` (roles, weights, counters, how long each file of metrics was), `replay.snapshot`, the
-newest regular checkpoint and the best one. It is written beside, synced and renamed; the two newest are kept. Every
-file is checksummed. Nothing is pickled.
+newest regular checkpoint and the best one. It is written beside, synced and renamed; the two newest are kept. A second
+state of the same turn is `turn-N.2`, so that none ever gives way to one that is not there yet. Every file is
+checksummed. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from typing import NamedTuple
 from apex_bat.replay.snapshot import SnapshotError, SnapshotWriter, read_snapshot
 from apex_bat.replay.store import ReplayStore
 from apex_bat.roles import checkpoint
-from apex_bat.storage import State, StorageError, read_arrays, sync_folder, write_arrays
+from apex_bat.storage import State, StorageError, beside_of, read_arrays, sync_folder, write_arrays
 
 FOLDER = "serial"
 KIND = "apex_bat serial state 1"
 NUM_KEPT = 2
 _STATE, _REPLAY, _BEST = "state.npz", "replay.snapshot", (checkpoint.BEST,)
-_NAME = re.compile(r"turn-(\d{12})")
+_NAME = re.compile(r"turn-(\d{12})(?:\.(\d+))?")
 _log = logging.getLogger(__name__)
 
 
@@ -50,7 +51,7 @@ def write(run: Path, turn: int, state: State, store: ReplayStore) -> Path:
 
     Args:
         run: the run folder; nothing in it may change meanwhile.
-        turn: number of the moment, greater than that of the state before.
+        turn: number of the moment.
         state: of everything but the replay.
         store: the replay.
 
@@ -58,7 +59,10 @@ def write(run: Path, turn: int, state: State, store: ReplayStore) -> Path:
         StorageError: it could not be written; those before are untouched.
     """
     folder = run / FOLDER / f"turn-{turn:012d}"
-    beside = folder.with_name(f".{folder.name}.part")
+    twins = [path for path in find(run) if _moment_of(path)[0] == turn]  # broken off at another point, or torn
+    if twins:
+        folder = folder.with_name(f"{folder.name}.{_moment_of(twins[-1])[1] + 1}")
+    beside = beside_of(folder)
     try:
         shutil.rmtree(beside, ignore_errors=True)
         beside.mkdir(parents=True)
@@ -75,21 +79,20 @@ def write(run: Path, turn: int, state: State, store: ReplayStore) -> Path:
         SnapshotWriter(store.buffer, beside / _REPLAY).advance(store.state, wait=True)
         write_arrays(beside / _STATE, KIND, header, state.arrays)
         sync_folder(beside)
-        shutil.rmtree(folder, ignore_errors=True)  # of the same moment: nothing has happened since
         beside.replace(folder)
         sync_folder(folder.parent)
     except OSError as error:
         raise StorageError(f"{folder}: cannot be written: {error.strerror or error}") from None
     finally:
         shutil.rmtree(beside, ignore_errors=True)
-    for old in find(run)[:-NUM_KEPT]:
+    for old in (*[path for path in find(run) if path not in twins][:-NUM_KEPT], *twins):
         shutil.rmtree(old, ignore_errors=True)
     return folder
 
 
 def find(run: Path) -> list[Path]:
     """Returns the folders of the saved states, oldest first."""
-    return sorted(path for path in (run / FOLDER).glob("turn-*") if _NAME.fullmatch(path.name))
+    return sorted((path for path in (run / FOLDER).glob("turn-*") if _NAME.fullmatch(path.name)), key=_moment_of)
 
 
 def read_newest(run: Path, store: ReplayStore) -> SavedRun | None:
@@ -154,6 +157,14 @@ def _read(folder: Path, store: ReplayStore) -> SavedRun:
     return SavedRun(folder, State(header["values"], arrays), header["metrics_bytes"], tuple(header["checkpoints"]))
 
 
+def _moment_of(folder: Path) -> tuple[int, int]:
+    """Returns the turn of a state and which of that turn's states it is, from 1, by its name."""
+    match = _NAME.fullmatch(folder.name)
+    if match is None:
+        raise ValueError(f"{folder.name} is not the name of a saved state")
+    return int(match[1]), int(match[2] or 1)
+
+
 def _lengths(folder: Path) -> dict[str, int]:
     """Returns the length of each file below a folder, after it reached the disk, by its relative path."""
     lengths = {}
@@ -166,7 +177,7 @@ def _lengths(folder: Path) -> dict[str, int]:
 
 def _copy(source: Path, target: Path) -> None:
     """Copies a file beside its target and renames it."""
-    beside = target.with_name(f".{target.name}.{os.getpid()}.part")
+    beside = beside_of(target)
     shutil.copyfile(source, beside)
     with beside.open("rb+") as file:
         os.fsync(file.fileno())

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from apex_bat.config import Config
 from apex_bat.launching.progress import Progress
 from apex_bat.launching.supervisor import Watched
-from apex_bat.roles.plan import roles_of
+from apex_bat.roles.plan import Role, roles_of
 from apex_bat.transport.messages import Report
 
 _RECENT_REPORTS = 30
@@ -24,8 +24,9 @@ class RoleStanding:
 
     def take(self, report: Report, now_s: float) -> None:
         """Takes a report; the counters of a former process are added to those of the new one."""
-        if self.newest is not None and self.newest.pid != report.pid:
-            for name, value in self.newest.metrics.items():
+        former = self.newest
+        if former is not None and (former.pid, former.host) != (report.pid, report.host):
+            for name, value in former.metrics.items():
                 self._before[name] = self._before.get(name, 0.0) + value
         self.newest, self.heard_s = report, now_s
 
@@ -68,6 +69,10 @@ class Standing:
         self._recent: dict[str, deque[tuple[float, float]]] = {
             name: deque(maxlen=_RECENT_REPORTS * config.actors) for name in ("return", "return_greedy")
         }
+
+    def add(self, role: Role) -> None:
+        """Counts a role more."""
+        self.roles[role.name] = RoleStanding()
 
     def take(self, report: Report, now_s: float) -> None:
         """Takes the report of a role; one of a role that the run does not have is ignored."""
@@ -156,7 +161,7 @@ class Standing:
         if watched.is_done:
             state = "ended"
         elif watched.handle is not None:
-            state = "starting"
+            state = watched.handle.waiting or "starting"
         else:
             state = f"waiting to be restarted: {watched.reason}" if watched.reason else "waiting to be started"
         current = report is not None and watched.handle is not None and report.pid == watched.handle.pid

@@ -81,9 +81,9 @@ def _judge(content: dict[str, Any], age_s: float, written_unix_s: float) -> tupl
     pid, since = content["launcher_pid"], _clock(written_unix_s)
     if content.get("ended"):
         return "ended", f"the run ended at {since}; these are its last figures"
-    began = content.get("launcher_began_unix_s")
+    birth = content.get("launcher_birth", content.get("launcher_began_unix_s"))  # as older versions noted it
     is_here = content.get("host") == socket.gethostname()
-    if is_here and began is not None and not is_same_process(pid, began):
+    if is_here and birth is not None and not is_same_process(pid, birth):
         return "gone", f"launcher gone since {since} (pid {pid}); these are the last figures it wrote"
     if age_s > QUIET_S:
         what = "it lives: stopped, or its disk is full or slow" if is_here else f"on {content.get('host')}"

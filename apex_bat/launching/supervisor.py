@@ -37,6 +37,8 @@ class Exit(NamedTuple):
     """Exit code; negative: the signal that killed it; None: the machine could not start it."""
     detail: str
     """What it said last, for the one line that a person reads."""
+    is_lost: bool = False
+    """Whether its machine was lost with it, which is no failure of the role."""
 
 
 class Handle(Protocol):
@@ -44,7 +46,11 @@ class Handle(Protocol):
 
     @property
     def pid(self) -> int:
-        """Number of its process."""
+        """Number of its process; 0 while it has none."""
+
+    @property
+    def waiting(self) -> str:
+        """For what it waits before its process can begin; empty once that was asked for."""
 
     def poll(self) -> Exit | None:
         """Returns how it ended, or None while it runs."""
@@ -99,11 +105,16 @@ class Supervisor:
         for watched in self.watched.values():
             self._begin(watched, now_s)
 
+    def add(self, role: Role, now_s: float) -> None:
+        """Starts a role more."""
+        self.watched[role.name] = Watched(role)
+        self._begin(self.watched[role.name], now_s)
+
     def heard(self, name: str, pid: int, now_s: float) -> None:
         """Notes a sign of life; one of a former process is ignored."""
         watched = self.watched.get(name)
         if watched is not None and watched.handle is not None and watched.handle.pid == pid:
-            watched.heard_s = now_s
+            watched.heard_s, watched.failed_starts = now_s, 0
 
     def watch(self, now_s: float) -> None:
         """Notices what ended or fell silent, and starts again what is due.
@@ -140,7 +151,8 @@ class Supervisor:
         watched.was_mute = False
         try:
             watched.handle = self._start(watched.role, watched.restarts)
-            watched.failed_starts = 0
+            if not watched.handle.waiting:
+                watched.failed_starts = 0
         except OSError as error:
             if error.errno not in TEMPORARY:
                 raise RoleFailedError(f"{watched.role.name}: cannot be started: {error.strerror or error}") from error
@@ -157,6 +169,9 @@ class Supervisor:
                 self._fail(watched, ended, now_s)
 
     def _check_silence(self, watched: Watched, handle: Handle, now_s: float) -> None:
+        if handle.waiting:  # for a place, which is nobody's silence
+            watched.started_s = now_s
+            return
         is_new = watched.heard_s is None
         silent_s = now_s - (watched.started_s if watched.heard_s is None else watched.heard_s)
         if silent_s > (self._launch.start_timeout_s if is_new else self._launch.heartbeat_timeout_s):
@@ -167,7 +182,7 @@ class Supervisor:
             handle.kill()
 
     def _fail(self, watched: Watched, ended: Exit, now_s: float) -> None:
-        if ended.code is None:
+        if ended.code is None or ended.is_lost:
             watched.failed_starts += 1
             doublings = watched.failed_starts - 1
         else:
@@ -198,6 +213,8 @@ def _forgive(watched: Watched, missed_s: float, now_s: float) -> None:
 
 def describe(ended: Exit) -> str:
     """Returns a few words on how a role ended."""
+    if ended.is_lost:
+        return f"lost with its machine: {ended.detail}"
     if ended.code is None:
         return f"cannot be started: {ended.detail}"
     if ended.code < 0:

@@ -1,7 +1,8 @@
 """The metrics of a run: rows appended to one file a role, TensorBoard events, and the recording of the training.
 
 Each row is a JSON object on a line of its own, written at once, whole or not at all, so that neither a crash nor a full
-disk tears one. What each figure is stands in `apex_bat.roles.metrics`.
+disk tears one. Where a power cut did, the next row begins on a new line. What each figure is stands in
+`apex_bat.roles.metrics`.
 """
 
 from __future__ import annotations
@@ -45,7 +46,6 @@ class MetricsWriter:
         """
         self._folder, self._training, self._clock, self._open_events = folder, training, clock, open_events
         self._files: dict[str, FileIO] = {}
-        (folder / "tensorboard").mkdir(exist_ok=True)
         self._events: EventsWriter | EventFile | None = None
         self._num_event_files = 0
 
@@ -70,7 +70,7 @@ class MetricsWriter:
         path = self._folder / f"{report.role}.jsonl"
         try:
             if report.role not in self._files:
-                self._files[report.role] = path.open("ab", buffering=0)
+                self._files[report.role] = path.open("a+b", buffering=0)
             _append_line(self._files[report.role], json.dumps(row))
             self._append_events(report, env_steps)
         except OSError as error:
@@ -81,6 +81,7 @@ class MetricsWriter:
         try:
             if self._events is None:
                 # Not SummaryWriter: its thread dies on a full disk, and its queue of ten then blocks us for ever.
+                (self._folder / "tensorboard").mkdir(exist_ok=True)
                 self._num_event_files += 1
                 suffix = "" if self._num_event_files == 1 else f".{self._num_event_files}"
                 self._events = self._open_events(str(self._folder / "tensorboard" / "events"), suffix)
@@ -104,9 +105,17 @@ class MetricsWriter:
 
 def _append_line(file: FileIO, text: str) -> None:
     """Appends a line in one piece; what a full disk took of it is cut off again. Raises OSError."""
-    data = text.encode() + b"\n"
     begin = file.seek(0, os.SEEK_END)
+    data = (b"\n" if _is_torn(file, begin) else b"") + text.encode() + b"\n"
     if file.write(data) == len(data):
         return
     file.truncate(begin)
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _is_torn(file: FileIO, length: int) -> bool:
+    """Whether the last line of a file of some length has no end, and what is appended would be lost with it."""
+    if length == 0:
+        return False
+    file.seek(length - 1)
+    return file.read(1) != b"\n"

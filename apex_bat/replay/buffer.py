@@ -45,6 +45,8 @@ class Sampled(NamedTuple):
     """(batch,): index of the actor that made each."""
     learner_steps: NDArray[np.int64]
     """(batch,): updates that the actor's weights had seen."""
+    largest_weight: float
+    """By what the importance weights (N P(i))^-beta of the batch were divided."""
 
 
 class BufferCounters(NamedTuple):
@@ -96,6 +98,11 @@ class ReplayBuffer:
         """Memory of all arrays, bytes."""
         arrays = [*self.row_arrays().values(), *self.item_arrays().values()]
         return sum(array.nbytes for array in arrays) + self._tree.nbytes
+
+    @property
+    def total(self) -> float:
+        """Sum of the priorities of all transitions held, after the exponent."""
+        return self._tree.total
 
     def row_arrays(self) -> dict[str, NDArray[Any]]:
         """Returns the rings of rows themselves (no copies). Row n stands at n % num_rows and never changes."""
@@ -165,19 +172,20 @@ class ReplayBuffer:
         positions = self._tree.sample(num_items, generator)
         shares = self._tree.get(positions) / self._tree.total
         weights = (len(self) * shares) ** -beta
+        largest_weight = float(weights.max())
         drawn = self._items.take(positions)
         rows = drawn["row"]
         states = self._states(np.concatenate([rows, rows + drawn["span"]]))
         batch = Batch(
             items=self._first_item + (positions - self._first_item) % self.capacity,
-            weights=(weights / weights.max()).astype(np.float32),
+            weights=(weights / largest_weight).astype(np.float32),
             states=States(states.echoes[:num_items], states.actions[:num_items]),
             actions=self._row_actions[rows % self.num_rows],
             rewards=drawn["reward"],
             discounts=drawn["discount"],
             next_states=States(states.echoes[num_items:], states.actions[num_items:]),
         )
-        return Sampled(batch, drawn["actor"], drawn["learner_step"])
+        return Sampled(batch, drawn["actor"], drawn["learner_step"], largest_weight)
 
     def update(self, items: NDArray[np.int64], priorities: NDArray[np.float32]) -> int:
         """Sets the priorities, positive, of items, and returns how many of these are gone and were left alone."""

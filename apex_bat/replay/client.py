@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from apex_bat.replay.reader import ReplayReader
+from apex_bat.replay.turns import TurnWriter
 from apex_bat.replay.writer import ReplayWriter
 
-__all__ = ["ReplayReader", "ReplayWriter"]
+__all__ = ["ReplayReader", "ReplayWriter", "TurnWriter"]

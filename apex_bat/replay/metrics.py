@@ -33,7 +33,10 @@ def declared_name(name: str) -> str:
 METRICS: dict[str, Metric] = {
     "replay.size": Metric("transitions", "held now"),
     "replay.inserted": Metric("transitions", "stored since the start of the run: size + evicted"),
-    "replay.sampled": Metric("transitions", "delivered to the learner"),
+    "replay.sampled": Metric(
+        "transitions", "delivered to the learner, as the law counts: with several servers, shared out by inserts"
+    ),
+    "replay.drawn": Metric("transitions", "drawn for the learner: with several servers, shared out by priorities"),
     "replay.evicted": Metric("transitions", "dropped, the oldest first, to make room"),
     "replay.received": Metric("transitions", "that arrived, each counted once: inserted + refused"),
     "replay.refused": Metric("transitions", "of inserts that were refused, for values or shapes that are wrong"),
@@ -95,4 +98,9 @@ READER_METRICS: dict[str, Metric] = {
     "reader.asked_again": Metric("requests", "sent again after a silence"),
     "reader.dropped_updates": Metric("updates", "of priorities that could not be sent"),
     "reader.refused_messages": Metric("messages", "from the server that were no messages"),
+    "reader.servers_away": Metric("servers", "of several that do not answer now; batches come from the others"),
+    "reader.parts_drawn_again": Metric("parts", "of batches whose server was lost, drawn from the others"),
+    "reader.misplaced_share": Metric(
+        "1", "of the draws that would have gone to another server by the totals of the moment of the draw; running mean"
+    ),
 }

@@ -17,6 +17,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+UNBOUNDED = 1 << 40
+"""Samples earned where there is no law."""
+
 
 class LimiterCounters(NamedTuple):
     """What a snapshot must keep so that the law goes on where it stopped."""
@@ -96,6 +99,13 @@ class RateLimiter:
         if self.never_block or self.inserted < self.min_size:
             return True
         return self.balance + self.samples_per_insert * num_transitions <= self.error_buffer
+
+    @property
+    def earned(self) -> int:
+        """Samples that need not wait now, if they come one by one; without a law, as many as anybody could want."""
+        if self.inserted < self.min_size:
+            return 0
+        return UNBOUNDED if self.never_block else max(0, int(self.balance + self.error_buffer))
 
     @property
     def holds_back_inserts(self) -> bool:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import OrderedDict, deque
 from typing import Literal
 
-from apex_bat.transport.messages import SampleRequest
+from apex_bat.transport.messages import PartRequest, SampleRequest
 
 MAX_EACH = 256  # of one connection; a learner asks for `learner.prefetch` ahead
 MAX_PEERS = 64  # connections with a request that waits
 
+Request = SampleRequest | PartRequest
 Verdict = Literal["queued", "held", "flood"]
 """What became of a request: it waits now; it waited already; its sender, or all together, ask for too much."""
 
@@ -18,13 +19,13 @@ class SampleRequests:
     """Queues of requests, one a connection."""
 
     def __init__(self) -> None:
-        self._queues: OrderedDict[bytes, deque[SampleRequest]] = OrderedDict()  # in the order in which they are served
+        self._queues: OrderedDict[bytes, deque[Request]] = OrderedDict()  # in the order in which they are served
 
     def __len__(self) -> int:
         """Requests that wait."""
         return sum(map(len, self._queues.values()))
 
-    def offer(self, peer: bytes, request: SampleRequest) -> Verdict:
+    def offer(self, peer: bytes, request: Request) -> Verdict:
         """Takes a request of a connection in, if it is new and there is room."""
         queue = self._queues.get(peer)
         if queue is None:
@@ -38,11 +39,11 @@ class SampleRequests:
         queue.append(request)
         return "queued"
 
-    def peek(self) -> SampleRequest | None:
+    def peek(self) -> Request | None:
         """Returns whose turn it is, or None when nothing waits."""
         return next(iter(self._queues.values()))[0] if self._queues else None
 
-    def take(self) -> tuple[bytes, SampleRequest]:
+    def take(self) -> tuple[bytes, Request]:
         """Removes what `peek` returned and returns it with its connection."""
         peer, queue = next(iter(self._queues.items()))
         request = queue.popleft()

@@ -1,15 +1,13 @@
 """The replay server: one socket, one thread, a plain poll loop around `ReplayStore`.
 
-Inserts wait in one queue an actor, sample requests in one queue; after each look at the socket the server stores and
-answers, in turn, all that the rate limiter allows. An insert is acknowledged when it is stored, so an actor whose
-window of unacknowledged inserts is full waits: that is how a slow learner slows the actors. A plain loop, because
-asyncio costs 2.9 times its CPU (measured).
+Inserts wait in one queue an actor, sample requests in one a learner; after each look at the socket the server stores
+and answers, in turn, all that the rate limiter allows. A plain loop, because asyncio costs 2.9 times its CPU
+(measured). `intake` is the actors' side of it, `outlet` the learner's; `saving` writes the snapshots.
 """
 
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,21 +17,22 @@ import numpy as np
 import zmq
 
 from apex_bat.config.settings import Config
-from apex_bat.replay.arrivals import Arrival, Arrivals, StoredSequence
+from apex_bat.replay.arrivals import Arrival
 from apex_bat.replay.heap import keep_freed_memory
-from apex_bat.replay.requests import SampleRequests
-from apex_bat.replay.snapshot import SnapshotError, SnapshotWriter, read_snapshot
-from apex_bat.replay.store import RefusedChunkError, ReplayStore
+from apex_bat.replay.intake import Intake
+from apex_bat.replay.outlet import Outlet
+from apex_bat.replay.saving import Snapshots
+from apex_bat.replay.snapshot import SnapshotError
+from apex_bat.replay.store import ReplayStore
 from apex_bat.transport.messages import (
-    Ack,
     Insert,
     InsertHeader,
     Message,
     MessageError,
+    PartRequest,
     PriorityUpdate,
     Ratio,
     RatioChange,
-    Sample,
     SampleRequest,
     Waiting,
     decode,
@@ -47,7 +46,6 @@ logger = logging.getLogger(__name__)
 
 RECEIVE_AT_ONCE = 64  # messages taken from the socket before those that wait are looked at
 WORK_S = 0.003  # time each for requests and for inserts that wait, before the socket is looked at again
-MAX_QUEUED_MESSAGES = 8  # of the largest size that may be sent: as many bytes of inserts may wait, whoever sent them
 NOTICE_PERIOD_S = 0.5  # how often the held-back are told why; clients send again only when they hear nothing
 COPY_BELOW_BYTES = 65_536  # ZeroMQ sends larger messages without copying them
 
@@ -86,20 +84,16 @@ class ReplayServer:
     ) -> None:
         keep_freed_memory()
         self.store = ReplayStore(config, generator)
-        self._arrivals = Arrivals(config.actor.window_chunks, MAX_QUEUED_MESSAGES * config.transport.max_message_bytes)
-        self._requests = SampleRequests()
-        self._batch_size = config.learner.batch_size
-        self._snapshot_path = snapshot_path
-        self._snapshot_period_s = config.replay.snapshot_period_s or math.inf
-        self._snapshot: SnapshotWriter | None = None
+        self._refusals = Refusals(logger, clock)
+        self._intake = Intake(config, self.store, self._refusals, self._send)
+        self._outlet = Outlet(config, self.store, self._refusals, self._send)
+        self._snapshots = Snapshots(self.store.buffer, snapshot_path, config.replay.snapshot_period_s, clock)
         self._generation = generation
         self._clock = clock
-        self._refusals = Refusals(logger, clock)
-        self._counts = dict.fromkeys(_COUNTS, 0)
+        self._undelivered = 0
         self._phases_s = dict.fromkeys(("idle", "receive", "insert", "sample", "update"), 0.0)
         self._has_work = False
         self._next_notice_s = clock()
-        self._next_snapshot_s = clock() + self._snapshot_period_s
         self._listener = Listener(
             zmq.ROUTER,
             address,
@@ -118,11 +112,12 @@ class ReplayServer:
         if ready:
             self._receive()
         # The same time for learner and actors, if both want all of it: neither can crowd out the other.
-        self._has_work = self._repeat(self._answer_next) | self._repeat(self._store_next)
+        self._has_work = self._repeat("sample", self._outlet.answer_next) | self._repeat(
+            "insert", self._intake.store_next
+        )
         if self._clock() >= self._next_notice_s:
             self._notify()
-        if self._snapshot_path is not None:
-            self._snapshot_in_background(self._snapshot_path)
+        self._snapshots.tend(self._state)
 
     def state(self) -> str:
         """Returns what the server does, or who waits for whom."""
@@ -130,13 +125,13 @@ class ReplayServer:
 
     def metrics(self) -> dict[str, float]:
         """Returns all figures that `replay.metrics.METRICS` describes."""
-        figures = self.store.metrics() | {f"replay.{name}": float(count) for name, count in self._counts.items()}
+        figures = self.store.metrics() | {f"replay.{name}": float(count) for name, count in self._counts().items()}
         figures["replay.refused_messages"] = self._refusals.total
         refused = self.refusals
         figures |= {f"replay.refused_messages.{reason}": float(refused.get(reason, 0)) for reason in REASONS}
         figures["replay.ended_connections"] = self._listener.num_ended
-        figures["replay.queued_inserts"] = len(self._arrivals)
-        figures["replay.queued_requests"] = len(self._requests)
+        figures["replay.queued_inserts"] = len(self._intake)
+        figures["replay.queued_requests"] = len(self._outlet.requests)
         figures |= {f"replay.{phase}_s": seconds for phase, seconds in self._phases_s.items()}
         return figures
 
@@ -147,10 +142,7 @@ class ReplayServer:
 
     def save(self) -> None:
         """Writes a snapshot and waits for it. Raises OSError if that fails, ValueError without a path."""
-        if self._snapshot_path is None:
-            raise ValueError("this server has no snapshot_path")
-        self._drop_snapshot()
-        SnapshotWriter(self.store.buffer, self._snapshot_path).advance(self._state, wait=True)
+        self._snapshots.save(self._state)
 
     def restore(self) -> str:
         """Takes over the newest sound snapshot and returns what was restored, as one line.
@@ -159,15 +151,13 @@ class ReplayServer:
             FileNotFoundError: there is none.
             SnapshotError: none is sound, or it does not fit the settings.
         """
-        if self._snapshot_path is None:
-            raise FileNotFoundError("this server has no snapshot_path")
-        state, path = read_snapshot(self._snapshot_path, self.store.buffer)
+        state, path = self._snapshots.read()
         try:
             self.store.restore(state)
-            self._arrivals.restore(
-                {actor: StoredSequence(s[0], s[1], tuple(s[2])) for actor, s in state["sequences"].items()}
-            )
-            self._counts |= {name: int(state["counts"][name]) for name in _COUNTS}
+            counts = state["counts"]
+            self._intake.restore(state["sequences"], counts)
+            self._snapshots.counts |= {name: int(counts[name]) for name in self._snapshots.counts}
+            self._undelivered = int(counts["undelivered"])
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise SnapshotError(f"{path}: its state contradicts itself: {error!r}") from error
         counters = self.store.buffer.counters
@@ -175,7 +165,7 @@ class ReplayServer:
 
     def close(self) -> None:
         """Closes the socket; a snapshot in the making is given up. May be called twice."""
-        self._drop_snapshot()
+        self._snapshots.drop()
         self._listener.close()
 
     def _receive(self) -> None:
@@ -198,9 +188,9 @@ class ReplayServer:
     def _handle(self, peer: bytes, message: Message, num_bytes: int) -> None:
         match message:
             case Insert():
-                self._arrive(peer, Arrival(message, "", num_bytes))
-            case SampleRequest():
-                self._queue_request(peer, message)
+                self._intake.arrive(peer, Arrival(message, "", num_bytes))
+            case SampleRequest() | PartRequest():
+                self._outlet.arrive(peer, message)
             case PriorityUpdate(learner_step, items, priorities):
                 begun = time.perf_counter()
                 self.store.update(learner_step, items, priorities)
@@ -219,97 +209,34 @@ class ReplayServer:
             try:
                 limiter.change(change.samples_per_insert, change.error_buffer)
                 logger.warning("samples per insert is now %g, within %g samples", *limiter.law)
-                self._next_snapshot_s = self._clock()  # so that a crash does not bring the old law back
+                self._snapshots.hasten()  # so that a crash does not bring the old law back
             except ValueError as error:
                 refused = str(error)
         return Ratio(*limiter.law, refused)
-
-    def _arrive(self, peer: bytes, arrival: Arrival) -> None:
-        header = arrival.header
-        verdict = self._arrivals.offer(arrival, peer)
-        if verdict in ("stored", "held"):
-            self._counts["duplicates"] += 1
-        elif verdict in ("gap", "flood"):
-            self._counts["out_of_turn"] += 1
-        if verdict == "stored":
-            self._send(peer, Ack(header.incarnation, header.sequence))
-        elif verdict == "superseded":
-            self._refusals.count("superseded", f"{header.actor}: another incarnation has taken its place")
-            self._send(peer, Ack(header.incarnation, header.sequence, superseded=True))
-
-    def _queue_request(self, peer: bytes, request: SampleRequest) -> None:
-        if request.batch_size != self._batch_size:
-            self._refusals.count("batch_size", f"{request.batch_size}; learner.batch_size is {self._batch_size}")
-            return
-        # Noted on arrival: when the request's turn comes, a later update may have told a later step.
-        self.store.learner_step = request.learner_step
-        if self._requests.offer(peer, request) == "flood":
-            self._refusals.count("flood", f"{len(self._requests)} sample requests wait already")
 
     def _refuse(self, peer: bytes, error: MessageError, num_bytes: int) -> None:
         """Counts a bad message. A bad insert with a readable header is refused in its turn: its actor can go on."""
         if isinstance(error.head, InsertHeader):
             self._refusals.count(error.fault, f"{error.head.actor}: {error}")
-            self._arrive(peer, Arrival(error.head, str(error), num_bytes))
+            self._intake.arrive(peer, Arrival(error.head, str(error), num_bytes))
         else:
             self._refusals.count(error.fault, str(error))
 
-    def _repeat(self, step: Callable[[], bool]) -> bool:
+    def _repeat(self, phase: str, step: Callable[[], bool]) -> bool:
         """Repeats a step while it finds work, for WORK_S at most; returns whether it found any."""
-        ends_s = time.perf_counter() + WORK_S
+        begun = time.perf_counter()
         found = False
         while step():
             found = True
-            if time.perf_counter() >= ends_s:
+            if time.perf_counter() >= begun + WORK_S:
                 break
+        self._spend(phase, begun)
         return found
-
-    def _store_next(self) -> bool:
-        """Stores or refuses the insert whose turn it is; returns whether there was one that need not wait."""
-        arrival = self._arrivals.peek()
-        if arrival is None:
-            return False
-        begun = time.perf_counter()
-        header, reason, _ = arrival
-        num_transitions = _num_transitions(header)
-        if isinstance(header, Insert) and not reason:
-            reason = self.store.limiter.refusal(num_transitions)
-            if reason:
-                self._refusals.count("chunk", f"{header.actor}: {reason}")
-        if isinstance(header, Insert) and not reason:
-            if not self.store.can_add(num_transitions):
-                return False
-            try:
-                self.store.add(header.actor, header.learner_step, header.chunks)
-            except RefusedChunkError as error:
-                reason = str(error)
-                self._refusals.count("chunk", reason)
-        if reason:
-            self._counts["refused"] += num_transitions
-        self._counts["received"] += num_transitions
-        peer = self._arrivals.settle()
-        if peer is not None:
-            self._send(peer, Ack(header.incarnation, header.sequence, reason[:500]))
-        self._spend("insert", begun)
-        return True
-
-    def _answer_next(self) -> bool:
-        """Answers the oldest sample request; returns whether there was one that need not wait."""
-        request = self._requests.peek()
-        if request is None or not self.store.can_sample(request.batch_size):
-            return False
-        begun = time.perf_counter()
-        peer, _ = self._requests.take()
-        batch = self.store.sample(request.batch_size, self.store.learner_step)
-        if self._send(peer, Sample(request.request, batch)):
-            self.store.count_sample(request.batch_size)
-        self._spend("sample", begun)
-        return True
 
     def _notify(self) -> None:
         """Tells everybody who is held back that the server lives, and for whom it waits."""
         self._next_notice_s = self._clock() + NOTICE_PERIOD_S
-        for peer in self._requests.peers() | set(self._arrivals.waiting_peers()):
+        for peer in self._outlet.requests.peers() | self._intake.waiting_peers():
             self._send(peer, Waiting(self.state()))
 
     def _send(self, peer: bytes, message: Message) -> bool:
@@ -321,41 +248,15 @@ class ReplayServer:
         except zmq.ZMQError as error:
             if error.errno not in (zmq.EAGAIN, zmq.EHOSTUNREACH):
                 raise
-            self._counts["undelivered"] += 1
+            self._undelivered += 1
             return False
         return True
 
     def _state(self) -> dict[str, Any]:
-        return self.store.state() | {"sequences": self._arrivals.stored_sequences(), "counts": self._counts.copy()}
+        return self.store.state() | {"sequences": self._intake.stored_sequences(), "counts": self._counts()}
 
-    def _snapshot_in_background(self, path: Path) -> None:
-        if self._snapshot is None:
-            if self._clock() >= self._next_snapshot_s:
-                self._snapshot = SnapshotWriter(self.store.buffer, path)
-            return
-        try:
-            if not self._snapshot.advance(self._state):
-                return
-            self._counts["snapshots"] += 1
-        except OSError as error:
-            self._counts["failed_snapshots"] += 1
-            logger.error("the snapshot of the replay failed, the one before is kept: %s", error)
-        self._snapshot = None
-        self._next_snapshot_s = self._clock() + self._snapshot_period_s
-
-    def _drop_snapshot(self) -> None:
-        if self._snapshot is not None:
-            self._snapshot.abandon()
-            self._snapshot = None
+    def _counts(self) -> dict[str, int]:
+        return {**self._intake.counts, "undelivered": self._undelivered, **self._snapshots.counts}
 
     def _spend(self, phase: str, begun: float) -> None:
         self._phases_s[phase] += time.perf_counter() - begun
-
-
-_COUNTS = ("received", "refused", "duplicates", "out_of_turn", "undelivered", "snapshots", "failed_snapshots")
-
-
-def _num_transitions(header: Insert | InsertHeader) -> int:
-    if isinstance(header, InsertHeader):
-        return sum(header.transitions)
-    return sum(len(chunk.starts) for chunk in header.chunks)

@@ -6,7 +6,8 @@ copies what is left at one moment: the items, and the few slices that changed si
 the only time in which the owner is held up.
 
 The file: a prefix, the sections one after the other, and a JSON header at the end that names each section's place, type
-and CRC-32. It is written beside, synced and renamed; the one before stays as `<name>.previous`. Nothing is pickled.
+and CRC-32. It is written beside, synced and renamed; the one before stays as `<name>.previous`. At every moment a whole
+one can be found, see `candidates`. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ PREFIX = struct.Struct("<8sIIQQ")  # magic, version, CRC-32 of the header, its o
 SLICE_ROWS = 1 << 14  # rows of a section: 3 MB of frames
 _LIES = (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, RecursionError)
 """What a header raises that is sound by its checksum and says what cannot be."""
+WRITING = ".writing"
 PASSES = 3  # over the rows; each is shorter than the one before
 
 
@@ -61,7 +63,7 @@ class SnapshotWriter:
     def __init__(self, buffer: ReplayBuffer, path: Path) -> None:
         self._buffer = buffer
         self._path = path
-        self._beside = path.with_name(path.name + ".writing")
+        self._beside = writing_of(path)
         self._row_begun = 0  # rows from this one on have changed since they were written to the file
         self._rows_written = threading.Event()
         self._final_given = threading.Event()
@@ -152,11 +154,11 @@ def read_snapshot(path: Path, buffer: ReplayBuffer) -> tuple[dict[str, Any], Pat
         FileNotFoundError: there is none.
         SnapshotError: none is sound, or it was made with other settings.
     """
-    candidates = [file for file in (path, previous_of(path)) if file.exists()]
-    if not candidates:
+    files = candidates(path)
+    if not files:
         raise FileNotFoundError(f"{path}: no snapshot of the replay")
     reasons = []
-    for file in candidates:
+    for file in files:
         try:
             return _read(file, buffer), file
         except (OSError, SnapshotError) as error:
@@ -192,9 +194,25 @@ def read_header(file: BinaryIO, path: Path) -> dict[str, Any]:
     return header
 
 
+def candidates(path: Path) -> list[Path]:
+    """Returns the files that may hold a whole snapshot, the newest first.
+
+    Between its two renames, which a kill can part, there is no file under the name itself: the new one is whole and
+    synced by then, and still under the name in which it was written.
+    """
+    previous, writing = previous_of(path), writing_of(path)
+    is_parted = previous.exists() and not path.exists()
+    return [file for file in (path, *([writing] if is_parted else []), previous) if file.exists()]
+
+
 def previous_of(path: Path) -> Path:
     """Returns where the snapshot before the newest lies."""
     return path.with_name(path.name + ".previous")
+
+
+def writing_of(path: Path) -> Path:
+    """Returns where a snapshot is written before it takes its name."""
+    return path.with_name(path.name + WRITING)
 
 
 def _shape_of(buffer: ReplayBuffer) -> dict[str, int]:

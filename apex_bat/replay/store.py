@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from apex_bat.config.settings import Config
 from apex_bat.experience import ACTION_MEMORY, Batch, Chunk
-from apex_bat.replay.buffer import ReplayBuffer
+from apex_bat.replay.buffer import ReplayBuffer, Sampled
 from apex_bat.replay.metrics import PRIORITY_EDGES, SHARED_ACTORS
 from apex_bat.replay.rate_limiter import LimiterCounters, RateLimiter
 
@@ -57,14 +57,7 @@ class ReplayStore:
         rows_each = ROW_RESERVE * (chunk + context + config.learner.num_step) / chunk
         num_rows = math.ceil((capacity + config.largest_insert) * rows_each)
         self.buffer = ReplayBuffer(capacity, num_rows, config.state_steps, config.heard_steps, settings.alpha)
-        self.limiter = RateLimiter(
-            settings.samples_per_insert,
-            math.ceil(settings.min_size / settings.shards),
-            settings.error_buffer,
-            largest_insert=config.largest_insert,
-            largest_sample=config.learner.batch_size,
-            never_block=settings.never_block,
-        )
+        self.limiter = limiter_of(config)
         self._has_action_memory = config.sensing.action_memory
         self.learner_step = 0
         self._updated_priorities = 0
@@ -98,6 +91,11 @@ class ReplayStore:
         lag = float(max(self.learner_step - learner_step, 0))
         self._means = self._means._replace(policy_lag=_smoothed(self._means.policy_lag, lag))
 
+    @property
+    def beta(self) -> float:
+        """Exponent of the importance weights now."""
+        return self._settings.beta + (self._settings.beta_end - self._settings.beta) * self._progress()
+
     def can_add(self, num_transitions: int) -> bool:
         """Whether the limiter lets so many transitions in now."""
         return self.limiter.can_insert(num_transitions)
@@ -108,9 +106,13 @@ class ReplayStore:
 
     def sample(self, num_transitions: int, learner_step: int) -> Batch:
         """Returns a batch; the caller has asked `can_sample`, and calls `count_sample` when it is delivered."""
+        return self.draw(num_transitions, learner_step).batch
+
+    def draw(self, num_transitions: int, learner_step: int) -> Sampled:
+        """Returns a batch and what is known about it beside, as `sample` does."""
         self.learner_step = learner_step
         self.buffer.set_alpha(self._alpha())
-        sampled = self.buffer.sample(num_transitions, self._beta(), self._generator)
+        sampled = self.buffer.sample(num_transitions, self.beta, self._generator)
         lag = float(np.maximum(learner_step - sampled.learner_steps, 0).mean())
         age = float((self.buffer.counters.next_item - sampled.batch.items).mean())
         self._means = self._means._replace(
@@ -120,7 +122,7 @@ class ReplayStore:
         if not self._has_action_memory:
             sampled.batch.states.actions[:] = 0
             sampled.batch.next_states.actions[:] = 0
-        return sampled.batch
+        return sampled
 
     def count_sample(self, num_transitions: int) -> None:
         """Counts a batch that was delivered."""
@@ -152,6 +154,7 @@ class ReplayStore:
             "replay.size": len(self.buffer),
             "replay.inserted": self.limiter.inserted,
             "replay.sampled": self.limiter.sampled,
+            "replay.drawn": int(self._sampled_by.sum()),
             "replay.evicted": counters.first_item,
             "replay.updated_priorities": self._updated_priorities,
             "replay.late_priorities": self._late_priorities,
@@ -168,7 +171,7 @@ class ReplayStore:
             **{f"replay.inserted_share.{actor}": shares[actor][0] for actor in most_sampled},
             **{f"replay.sampled_share.{actor}": shares[actor][1] for actor in most_sampled},
             "replay.alpha": self.buffer.alpha,
-            "replay.beta": self._beta(),
+            "replay.beta": self.beta,
             "replay.mb": self.buffer.nbytes / 1e6,
             **self._priority_histogram(),
         }
@@ -236,9 +239,23 @@ class ReplayStore:
             return start
         return start + (end - start) * math.floor(self._progress() * ALPHA_STEPS) / ALPHA_STEPS
 
-    def _beta(self) -> float:
-        return self._settings.beta + (self._settings.beta_end - self._settings.beta) * self._progress()
-
 
 def _smoothed(mean: float, value: float) -> float:
     return value if mean == 0.0 else mean + SMOOTHING * (value - mean)
+
+
+def limiter_of(config: Config) -> RateLimiter:
+    """Returns the rate limiter of one store of `replay.shards`: each has its part of the first size and of the band.
+
+    Raises:
+        ValueError: actors and learner could come to wait for each other.
+    """
+    settings = config.replay
+    return RateLimiter(
+        settings.samples_per_insert,
+        math.ceil(settings.min_size / settings.shards),
+        None if settings.error_buffer is None else settings.error_buffer / settings.shards,
+        largest_insert=config.largest_insert,
+        largest_sample=config.learner.batch_size,
+        never_block=settings.never_block,
+    )

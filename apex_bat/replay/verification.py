@@ -7,7 +7,7 @@ import zlib
 from pathlib import Path
 from typing import NamedTuple
 
-from apex_bat.replay.snapshot import SnapshotError, previous_of, read_header
+from apex_bat.replay.snapshot import SnapshotError, candidates, read_header
 
 
 class SnapshotFacts(NamedTuple):
@@ -32,9 +32,7 @@ def verify(path: Path) -> SnapshotFacts | None:
         SnapshotError: there are snapshots, and none is sound.
     """
     reasons: list[str] = []
-    for file in (path, previous_of(path)):
-        if not file.exists():
-            continue
+    for file in candidates(path):
         try:
             return _verify(file)._replace(refused="; ".join(reasons))
         except (OSError, SnapshotError) as error:

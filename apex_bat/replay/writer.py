@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 import time
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 
@@ -22,7 +21,7 @@ class ReplayWriter:
     """Sends the chunks of one actor to its replay server.
 
     Args:
-        address: of the server; of several that share the transitions, the actor's name chooses one.
+        address: of the server.
         actor: name, the same after a restart.
         window_chunks: chunks that may be unacknowledged.
         keys: CURVE keys, for an address that is not loopback.
@@ -39,7 +38,7 @@ class ReplayWriter:
 
     def __init__(
         self,
-        address: str | Sequence[str],
+        address: str,
         actor: str,
         window_chunks: int,
         *,
@@ -50,8 +49,6 @@ class ReplayWriter:
         max_message_bytes: int = MAX_MESSAGE_BYTES,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        addresses = [address] if isinstance(address, str) else list(address)
-        chosen = addresses[zlib.crc32(actor.encode()) % len(addresses)]
         self._actor = actor
         self._window_chunks = window_chunks
         self._generation = generation
@@ -72,8 +69,20 @@ class ReplayWriter:
         # IMMEDIATE: without a connection nothing is queued, so the window is all that an actor has under way.
         options: dict[int, int] = {zmq.IMMEDIATE: 1}
         self._connection = Connection(
-            zmq.DEALER, chosen, keys=keys, max_message_bytes=max_message_bytes, options=options
+            zmq.DEALER, address, keys=keys, max_message_bytes=max_message_bytes, options=options
         )
+
+    def redirect(self, address: str, generation: int) -> None:
+        """Goes to the server at another address, with all that is unacknowledged.
+
+        Raises:
+            TransportError: the address cannot be used.
+        """
+        self._connection.redirect(address)
+        if generation != self._generation:
+            self._generation = generation
+            self._next_to_send = next(iter(self._window), self._next_sequence)
+            self.waiting = ""
 
     @property
     def has_room(self) -> bool:
@@ -84,6 +93,11 @@ class ReplayWriter:
     def unacknowledged(self) -> int:
         """Inserts that the server has not answered for."""
         return len(self._window)
+
+    @property
+    def socket(self) -> zmq.Socket[bytes]:
+        """What answers come by, to be waited for together with others."""
+        return self._connection.socket
 
     def send(self, chunks: Sequence[Chunk], learner_step: int) -> None:
         """Sends chunks as one insert. Their arrays must not change afterwards: they may have to go again.

@@ -17,7 +17,7 @@ from apex_bat.agent.exploration import GREEDY_EPSILON, annealed, choose_actions,
 from apex_bat.agent.inference import Policy, PolicyValues, parameter_shapes
 from apex_bat.agent.n_step import Accumulator
 from apex_bat.experience import Chunk, States
-from apex_bat.replay.client import ReplayWriter
+from apex_bat.replay.client import TurnWriter
 from apex_bat.roles.episodes import EpisodeRecorder
 from apex_bat.roles.lines import ExperienceSink, WeightsSource
 from apex_bat.roles.plan import Assignment
@@ -46,15 +46,18 @@ def run_actor(assignment: Assignment) -> None:
         )  # fmt: skip
         writer = stack.enter_context(
             closing(
-                ReplayWriter(
-                    addresses.replay, assignment.role.name, config.actor.window_chunks, keys=keys,
-                    generation=addresses.replay_generation,
+                TurnWriter(
+                    addresses.replays, assignment.role.name, config.actor.window_chunks, first=assignment.role.number,
+                    keys=keys, generation=addresses.replay_generations,
                 )
             )
         )  # fmt: skip
         reporter = stack.enter_context(closing(RoleReporter(assignment)))
         actor = stack.enter_context(closing(Actor(assignment, writer, weights, reporter)))
         while not assignment.stop.is_set():
+            if (moved := assignment.moved()) is not None:
+                writer.redirect(moved.replays, moved.replay_generations)
+                weights.redirect(moved.weights, moved.weights_generation)
             if actor.is_ready(_WAIT_S):
                 actor.step()
         actor.report("sending the last chunks")
@@ -74,7 +77,9 @@ class Actor:
             config.bats_per_actor, config.arena, config.condition, body=config.body, rays=config.rays,
             sonar=config.sonar, sensing=config.sensing, episode=config.episode, autoreset_mode=AutoresetMode.DISABLED,
         )  # fmt: skip
-        self._epsilons = ladder_of_actor(role.number, config.actors, config.bats_per_actor, config.exploration)
+        self._epsilons = ladder_of_actor(
+            role.number % config.actors, config.actors, config.bats_per_actor, config.exploration
+        )
         self._accumulators = [
             Accumulator(
                 config.learner.num_step, config.learner.discount, config.state_steps, config.actor.chunk_transitions

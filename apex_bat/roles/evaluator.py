@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,11 +39,23 @@ class Evaluator:
     flatter the final figures.
     """
 
-    def __init__(self, assignment: Assignment, reporter: RoleReporter | None = None) -> None:
-        """Takes the evaluator's part of the run; `reporter` None: one that reports where the assignment says."""
+    def __init__(
+        self,
+        assignment: Assignment,
+        reporter: RoleReporter | None = None,
+        between_steps: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Takes the evaluator's part of the run.
+
+        Args:
+            assignment: the role, the run and its settings.
+            reporter: tells what it does; None: one that reports where the assignment says.
+            between_steps: is called before each step of all flights, for who has something else to do meanwhile.
+        """
         self._assignment = assignment
         config = assignment.config
         self._config = config
+        self._between_steps = between_steps
         self._policy = Policy(config.network, config.state_steps)
         self._reporter = reporter or RoleReporter(assignment)
         self._judged = ""  # name of the checkpoint
@@ -135,4 +148,5 @@ class Evaluator:
     def _is_stopped(self) -> bool:
         if self._reporter.is_due:
             self._reporter.send("flying")
+        self._between_steps()
         return self._assignment.stop.is_set()

@@ -36,15 +36,17 @@ def run_learner(assignment: Assignment) -> None:
         reader = stack.enter_context(
             closing(
                 ReplayReader(
-                    addresses.replay, config.learner.batch_size, config.learner.prefetch,
-                    learner_step=agent.num_updates, keys=keys, generation=addresses.replay_generation,
-                    max_message_bytes=config.transport.max_message_bytes,
+                    addresses.replays, config.learner.batch_size, config.learner.prefetch,
+                    learner_step=agent.num_updates, keys=keys, generation=addresses.replay_generations,
+                    max_message_bytes=config.transport.max_message_bytes, generator=assignment.generator(),
                 )
             )
         )  # fmt: skip
         reporter = stack.enter_context(closing(RoleReporter(assignment, addresses.weights)))
         learner = Learner(assignment, agent, version, reader, publisher, reporter)
         while not (assignment.stop.is_set() or learner.is_done):
+            if (moved := assignment.moved()) is not None:
+                reader.redirect(moved.replays, moved.replay_generations)
             learner.step(_WAIT_S)
             for reason in PUBLISHER_REASONS:
                 reporter.gauge(f"weights.refused.{reason}", publisher.refusals.counts.get(reason, 0))

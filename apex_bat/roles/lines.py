@@ -18,8 +18,9 @@ from apex_bat.transport.messages import Weights
 class ExperienceSink(Protocol):
     """Where an actor's chunks go."""
 
-    waiting: str
-    """For whom the replay waits; empty when it stores at once."""
+    @property
+    def waiting(self) -> str:
+        """For whom the replay waits; empty when it stores at once."""
 
     @property
     def has_room(self) -> bool:

@@ -47,6 +47,18 @@ class Addresses(Endpoints, frozen=True, kw_only=True):
     """The same for the weights; another number, because whoever may listen to them learns it."""
     reports_generation: Generation = 0
     """The same for reports."""
+    further_replays: tuple[tuple[str, Generation], ...] = ()
+    """Address and generation of the replay servers beyond the first, where several share the transitions."""
+
+    @property
+    def replays(self) -> list[str]:
+        """Addresses of all replay servers, by their numbers."""
+        return [self.replay, *(address for address, _ in self.further_replays)]
+
+    @property
+    def replay_generations(self) -> list[int]:
+        """Their generations."""
+        return [self.replay_generation, *(generation for _, generation in self.further_replays)]
 
 
 class Role(NamedTuple):
@@ -54,11 +66,13 @@ class Role(NamedTuple):
 
     kind: Kind
     number: int
+    of: int = 1
+    """How many of its kind the run has; told of replay servers only."""
 
     @property
     def name(self) -> str:
-        """`replay`, `learner`, `evaluator`, or `actor-3`."""
-        return f"actor-{self.number}" if self.kind == "actor" else self.kind
+        """`replay`, `learner`, `evaluator`, or `actor-3`; `replay-0` where several replay servers share the work."""
+        return f"{self.kind}-{self.number}" if self.kind == "actor" or self.of > 1 else self.kind
 
 
 class Assignment(NamedTuple):
@@ -77,6 +91,10 @@ class Assignment(NamedTuple):
     """Environment steps of the whole run when this role was started, for what runs over the steps of all bats."""
     clock: Callable[[], float] = time.monotonic
     """Seconds, never backwards: what periods are measured by. The serial mode has one of simulated time."""
+    moved: Callable[[], Addresses | None] = lambda: None
+    """Returns the addresses anew, once, when a server of the run listens elsewhere; else None."""
+    given_keys: Keys | None = None
+    """CURVE keys that the launcher has handed over; None: those of the folder that the settings name, if any."""
 
     def generator(self) -> np.random.Generator:
         """Returns the role's own random stream, derived from the run's seed, its kind, number and incarnation."""
@@ -84,11 +102,13 @@ class Assignment(NamedTuple):
         return np.random.default_rng([self.config.seed, kind, self.role.number, self.incarnation])
 
     def keys(self) -> Keys | None:
-        """Returns the CURVE keys that the settings name; None without.
+        """Returns the CURVE keys of the run: those given, or those that the settings name; None without.
 
         Raises:
             TransportError: they are missing or others may read them.
         """
+        if self.given_keys is not None:
+            return self.given_keys
         folder = self.config.transport.keys
         return load_keys(Path(folder)) if folder else None
 
@@ -114,9 +134,15 @@ def incarnation_of(part: int, restarts: int) -> int:
     return part * _LIVES_OF_A_PART + restarts
 
 
+def role_of(kind: Kind, number: int, config: Config) -> Role:
+    """Returns a role of a run by its number."""
+    return Role(kind, number, config.replay.shards) if kind == "replay" else Role(kind, number)
+
+
 def roles_of(config: Config) -> list[Role]:
     """Returns the roles of a run in the order in which they start."""
-    roles = [Role("replay", 0), Role("learner", 0), *(Role("actor", i) for i in range(config.actors))]
+    replays = [role_of("replay", i, config) for i in range(config.replay.shards)]
+    roles = [*replays, Role("learner", 0), *(Role("actor", i) for i in range(config.actors))]
     if config.evaluation.during_training:
         roles.append(Role("evaluator", 0))
     return roles

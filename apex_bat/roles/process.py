@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
@@ -16,7 +17,8 @@ from types import FrameType
 from apex_bat.config import Config, ConfigError, load
 from apex_bat.replay.snapshot import SnapshotError
 from apex_bat.roles.logs import RotatingLog
-from apex_bat.roles.plan import Assignment, Kind, Role, read_addresses
+from apex_bat.roles.orders import StandingOrders
+from apex_bat.roles.plan import Addresses, Assignment, Kind, Role, read_addresses, role_of
 from apex_bat.storage import StorageError
 from apex_bat.transport.security import TransportError
 
@@ -28,16 +30,26 @@ _PR_SET_PDEATHSIG = 1
 _log = logging.getLogger(__name__)
 
 
-def run_process(kind: Kind, number: int, run: Path, incarnation: int, leashed: bool, flown_steps: int = 0) -> int:
+def run_process(
+    kind: Kind,
+    number: int,
+    run: Path,
+    incarnation: int,
+    leashed: bool,
+    flown_steps: int = 0,
+    *,
+    is_ordered: bool = False,
+) -> int:
     """Runs a role until it is told to stop and returns its exit code.
 
     Args:
         kind: which role.
         number: which of its kind.
-        run: the run folder, with config.toml and addresses.json.
+        run: the run folder, with config.toml and, unless the role is ordered, addresses.json.
         incarnation: number of this life of the role, see `plan.incarnation_of`.
         leashed: whether the end of standard input means stop; then the role writes its log itself.
         flown_steps: environment steps of the whole run before this start.
+        is_ordered: whether addresses and keys come on standard input, see `roles.orders`; leashed as well.
 
     Returns:
         0 when it ended by itself or by its leash, 1 when it failed, 2 when starting it again would fail in the same
@@ -50,11 +62,12 @@ def run_process(kind: Kind, number: int, run: Path, incarnation: int, leashed: b
     heard = _hear_signals(stop)
     try:
         config = load(run / "config.toml")
-        addresses = read_addresses(run / ADDRESSES)
-        if leashed:
+        role = role_of(kind, number, config)
+        orders = StandingOrders() if is_ordered else None
+        if leashed or is_ordered:
             _write_log(role, run, config)
-            hold_leash(stop, config.launch.grace_s)
-        _run(Assignment(role, config, run, addresses, stop, incarnation, flown_steps))
+            hold_leash(stop, config.launch.grace_s, orders.heed if orders is not None else None)
+        _run(_assigned(Assignment(role, config, run, Addresses("", "", ""), stop, incarnation, flown_steps), orders))
     except KeyboardInterrupt:
         return INTERRUPTED
     except (ConfigError, TransportError, StorageError, SnapshotError) as error:
@@ -66,19 +79,34 @@ def run_process(kind: Kind, number: int, run: Path, incarnation: int, leashed: b
     return heard[0] if heard else 0
 
 
-def hold_leash(stop: threading.Event, grace_s: float) -> None:
+def _assigned(given: Assignment, orders: StandingOrders | None) -> Assignment:
+    """Returns an assignment with its addresses and keys: those ordered, or those of the run folder.
+
+    Raises:
+        StorageError, TransportError: there are none.
+    """
+    if orders is None:
+        return given._replace(addresses=read_addresses(given.run / ADDRESSES))
+    addresses = orders.first()
+    return given._replace(addresses=addresses, moved=orders.moved, given_keys=orders.keys)
+
+
+def hold_leash(stop: threading.Event, grace_s: float, heed: Callable[[bytes], None] | None = None) -> None:
     """Watches standard input in a thread: at its end, the role is asked to stop, and ended by force after its grace.
+
+    What comes on standard input before its end goes to `heed`.
 
     The end by force needs nothing of Python, so that a role that is blocked in C code ends too; it leaves in the log
     where the role was. A stopped process is continued by the kernel when its launcher dies (Linux), or it would stay.
     """
     _be_continued_when_orphaned()
-    threading.Thread(target=_watch_leash, args=(stop, grace_s), daemon=True).start()
+    threading.Thread(target=_watch_leash, args=(stop, grace_s, heed), daemon=True).start()
 
 
-def _watch_leash(stop: threading.Event, grace_s: float) -> None:
-    while os.read(0, 4096):  # not sys.stdin: its lock, held here, would abort the interpreter's end
-        pass
+def _watch_leash(stop: threading.Event, grace_s: float, heed: Callable[[bytes], None] | None) -> None:
+    while data := os.read(0, 4096):  # not sys.stdin: its lock, held here, would abort the interpreter's end
+        if heed is not None:
+            heed(data)
     faulthandler.dump_traceback_later(grace_s, exit=True)
     stop.set()
 

@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import logging
 from contextlib import suppress
+from pathlib import Path
 
 from apex_bat.replay.server import ReplayServer
-from apex_bat.roles.plan import Assignment
+from apex_bat.roles.plan import Assignment, Role
 from apex_bat.roles.reporting import RoleReporter
 
-SNAPSHOT = "replay.snapshot"
 _log = logging.getLogger(__name__)
 _WAIT_S = 0.2
 
 
+def snapshot_of(run: Path, role: Role) -> Path:
+    """Returns where a replay server keeps its newest snapshot: `replay/replay.snapshot`, or `replay-0.snapshot`."""
+    return run / "replay" / f"{role.name}.snapshot"
+
+
 def run_replay(assignment: Assignment) -> None:
     """Serves until told to stop; restores the newest snapshot first and writes a last one."""
-    path = assignment.run / "replay" / SNAPSHOT
+    path, number = snapshot_of(assignment.run, assignment.role), assignment.role.number
+    address = assignment.addresses.replays[number]
     server = ReplayServer(
-        assignment.config, assignment.addresses.replay, assignment.generator(), path, keys=assignment.keys(),
-        generation=assignment.addresses.replay_generation,
+        assignment.config, address, assignment.generator(), path, keys=assignment.keys(),
+        generation=assignment.addresses.replay_generations[number],
     )  # fmt: skip
-    reporter = RoleReporter(assignment, assignment.addresses.replay)
+    reporter = RoleReporter(assignment, address)
     try:
         with suppress(FileNotFoundError):
             _log.info("continues: %s", server.restore())

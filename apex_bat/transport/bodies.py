@@ -33,9 +33,9 @@ def taken_apart(message: Message) -> tuple[Headers, Sequence[NDArray[Any]], list
         case Insert():
             header = _insert_header(message)
             return header, [_joined(message.chunks, field) for field in _CHUNK_ORDER], _insert_specs(header)
-        case Sample(request, batch):
+        case Sample(request, batch, standing):
             size, num_rows, _ = batch.states.echoes.shape
-            sample = SampleHeader(request, size, num_rows // NUM_EARS)
+            sample = SampleHeader(request, size, num_rows // NUM_EARS, standing)
             arrays: list[NDArray[Any]] = [
                 batch.items,
                 batch.weights,
@@ -173,7 +173,8 @@ def _sample(header: SampleHeader, body: memoryview) -> Sample:
     for array in (taken, next_taken, actions):
         _check("actions", array, 0, NUM_ACTIONS - 1)
     states, next_states = States(echoes, taken), States(next_echoes, next_taken)
-    return Sample(header.request, Batch(items, weights, states, actions, rewards, discounts, next_states))
+    batch = Batch(items, weights, states, actions, rewards, discounts, next_states)
+    return Sample(header.request, batch, header.standing)
 
 
 def _priority_specs(header: PriorityHeader) -> list[ArraySpec]:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 MAGIC = b"ABAT"
-PROTOCOL = 1
+PROTOCOL = 2
 PREFIX = struct.Struct("<4sHHIIQ")  # magic, protocol, reserved (0), header bytes, body bytes, generation
 MAX_HEADER_BYTES = 1 << 20
 ALIGNMENT = 8

@@ -83,19 +83,54 @@ class SampleRequest(Header, frozen=True, tag="request"):
     learner_step: Number
 
 
+class PartRequest(Header, frozen=True, tag="part"):
+    """Asks one of several servers for its part of a batch, which is drawn at once: whoever asks keeps the law.
+
+    The part is as large as the server's share of all priorities; what its rate limiter counts follows from inserts.
+    """
+
+    request: Number
+    size: Annotated[int, Meta(ge=0, le=65_536)]
+    """Transitions to draw; with 0, or when nothing is held, a `Standing` is the answer."""
+    charge: Annotated[int, Meta(ge=0, le=1 << 31)]
+    """Samples that the rate limiter is to count for it."""
+    learner_step: Number
+
+
+class Standing(Header, frozen=True, tag="standing"):
+    """How one of several servers stands: comes with each part, or is the whole answer to a request for nothing."""
+
+    request: Number
+    held: Number
+    """Transitions."""
+    total: Annotated[float, Meta(ge=0.0, le=1e18)]
+    """Sum of their priorities, after the exponent."""
+    earned: Number
+    """Samples that its rate limiter would let out now."""
+    beta: Annotated[float, Meta(ge=0.0, le=1.0)]
+    """Exponent of the importance weights."""
+    largest_weight: Annotated[float, Meta(ge=0.0, le=1e18)] = 0.0
+    """By what the weights of the part were divided; 0 without a part."""
+    reason: Text = ""
+    """For whom the server waits."""
+
+
 class SampleHeader(Header, frozen=True, tag="sample"):
     """Header of a `Sample`."""
 
     request: Number
     size: Annotated[int, Meta(ge=1, le=65_536)]
     memory_steps: Annotated[int, Meta(ge=1, le=255)]
+    standing: Standing | None = None
 
 
 class Sample(NamedTuple):
-    """A batch and the number of the request that it answers."""
+    """A batch, or one server's part of it, and the number of the request that it answers."""
 
     request: int
     batch: Batch
+    standing: Standing | None = None
+    """Of the server at the moment of the draw; with a part only."""
 
 
 class PriorityHeader(Header, frozen=True, tag="priorities"):
@@ -159,12 +194,27 @@ class Report(Header, frozen=True, tag="report"):
     metrics: Annotated[dict[Name, float], Meta(max_length=1024)]
 
 
-Message = Insert | Ack | Waiting | SampleRequest | Sample | PriorityUpdate | RatioChange | Ratio | Weights | Report
+Message = (
+    Insert
+    | Ack
+    | Waiting
+    | SampleRequest
+    | PartRequest
+    | Standing
+    | Sample
+    | PriorityUpdate
+    | RatioChange
+    | Ratio
+    | Weights
+    | Report
+)
 Headers = (
     InsertHeader
     | Ack
     | Waiting
     | SampleRequest
+    | PartRequest
+    | Standing
     | SampleHeader
     | PriorityHeader
     | RatioChange

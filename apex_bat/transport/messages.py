@@ -2,6 +2,7 @@
 
     actor   -> replay   Insert            replay -> actor    Ack, Waiting
     learner -> replay   SampleRequest     replay -> learner  Sample, Waiting
+    learner -> replay   PartRequest       replay -> learner  Sample, Standing
     learner -> replay   PriorityUpdate
     anybody -> replay   RatioChange       replay -> anybody  Ratio
     learner -> actors   Weights           any    -> launcher Report
@@ -22,12 +23,14 @@ from apex_bat.transport.kinds import (
     Insert,
     InsertHeader,
     Message,
+    PartRequest,
     PriorityUpdate,
     Ratio,
     RatioChange,
     Report,
     Sample,
     SampleRequest,
+    Standing,
     Waiting,
     Weights,
 )
@@ -42,6 +45,8 @@ __all__ = [
     "Ack",
     "Waiting",
     "SampleRequest",
+    "PartRequest",
+    "Standing",
     "Sample",
     "PriorityUpdate",
     "RatioChange",

@@ -9,6 +9,7 @@ from collections.abc import Collection
 import msgspec
 import zmq
 
+from apex_bat.transport.framing import split
 from apex_bat.transport.messages import MessageError, Report, decode, encode
 from apex_bat.transport.refusals import Refusals
 from apex_bat.transport.security import Keys
@@ -71,6 +72,8 @@ class ReportCollector:
 
     Attributes:
         address: where it listens.
+        generations: of roles that were given one of their own for their present life; what a former life still says is
+            refused. The others have `generation`.
         refusals: counts of refused reports and connections by reason.
 
     Raises:
@@ -88,8 +91,14 @@ class ReportCollector:
         self.refusals = Refusals(logger)
         self._listener = Listener(zmq.PULL, address, self.refusals, keys=keys, max_message_bytes=MAX_REPORT_BYTES)
         self._generation = generation
-        self._roles = None if roles is None else frozenset(roles)
+        self._roles = None if roles is None else set(roles)
         self.address = self._listener.address
+        self.generations: dict[str, int] = {}
+
+    def admit(self, role: str) -> None:
+        """Lets a role more report."""
+        if self._roles is not None:
+            self._roles.add(role)
 
     def poll(self, timeout_s: float) -> list[Report]:
         """Returns the reports that are there, waiting up to `timeout_s` for the first message."""
@@ -108,9 +117,11 @@ class ReportCollector:
     def _checked(self, parts: list[bytes]) -> Report:
         if len(parts) != 1:
             raise MessageError("parts", f"{len(parts)} instead of one")
-        message = decode(parts[0], self._generation)
+        message = decode(parts[0], None if self.generations else self._generation)
         if not isinstance(message, Report):
             raise MessageError("unexpected", f"a {type(message).__name__} instead of a report")
+        if self.generations:
+            split(parts[0], self.generations.get(message.role, self._generation))
         if self._roles is not None and message.role not in self._roles:
             raise MessageError("role", f"{message.role} is no role of this run")
         return message

@@ -40,6 +40,10 @@ class Keys(NamedTuple):
     allowed_clients: frozenset[bytes] = frozenset()
     """Public keys that servers let in."""
 
+    def of_client(self) -> Keys:
+        """Returns what a host needs that only connects."""
+        return self._replace(server_secret=None, allowed_clients=frozenset())
+
 
 def make_keys(folder: Path) -> Keys:
     """Writes new keys of a server and a client into a folder (mode 0700, files 0600) and returns them.
@@ -47,18 +51,24 @@ def make_keys(folder: Path) -> Keys:
     Raises:
         TransportError: the folder holds keys already, others may enter it, or it cannot be written.
     """
-    server_public, server_secret = zmq.curve_keypair()
-    client_public, client_secret = zmq.curve_keypair()
+    keys = new_keys()
     _write_keys(
         folder,
         {
-            "server.public": server_public,
-            "server.secret": server_secret,
-            "client.public": client_public,
-            "client.secret": client_secret,
-            "allowed_clients": client_public,
+            "server.public": keys.server_public,
+            "server.secret": keys.server_secret or b"",
+            "client.public": keys.client_public,
+            "client.secret": keys.client_secret,
+            "allowed_clients": keys.client_public,
         },
     )
+    return keys
+
+
+def new_keys() -> Keys:
+    """Returns new keys of a server and of the one client that it lets in."""
+    server_public, server_secret = zmq.curve_keypair()
+    client_public, client_secret = zmq.curve_keypair()
     return Keys(server_public, client_public, client_secret, server_secret, frozenset([client_public]))
 
 

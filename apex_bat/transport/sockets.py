@@ -15,6 +15,7 @@ from __future__ import annotations
 import ipaddress
 import logging
 import os
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -38,6 +39,7 @@ MAX_MESSAGE_BYTES = Transport().max_message_bytes
 HIGH_WATER = 64  # messages queued in each direction of a connection
 KERNEL_BUFFER_BYTES = 1 << 18  # without it the kernel took 115 messages past a high-water mark of 10 (measured)
 KEEPALIVE_S = 1  # of silence until TCP asks whether the peer is there, and between its questions
+LEAVE_S = 1.0  # at most, until a peer that was left takes no more messages
 LOST_MS = (
     4000  # without an answer to data or question, after which a peer counts as gone: a pulled cable shows no other
 )
@@ -118,7 +120,7 @@ class Listener:
 
 
 class Connection:
-    """A socket that connects, and keeps connecting, to one address.
+    """A socket that connects, and keeps connecting, to one address; to another one after `redirect`.
 
     Attributes:
         socket: the socket.
@@ -137,6 +139,7 @@ class Connection:
     ) -> None:
         check_address(address, keys, listening=False)
         self.address = address
+        self._keys = keys
         self._context: zmq.Context[Socket] = zmq.Context()
         self.socket: Socket = self._context.socket(kind)
         _bound(self.socket, address, max_message_bytes, high_water, options)
@@ -147,6 +150,29 @@ class Connection:
             self.socket.connect(address)
         except zmq.ZMQError as error:
             self.close()
+            raise TransportError(f"{address}: cannot connect: {error.strerror}") from error
+
+    def redirect(self, address: str) -> None:
+        """Leaves the peer, which has moved or was replaced, for another address; what was queued for it is lost.
+
+        Raises:
+            TransportError: the address cannot be used.
+        """
+        check_address(address, self._keys, listening=False)
+        if address == self.address:
+            return
+        with suppress(zmq.ZMQError):  # of an address that the socket has given up by itself
+            self.socket.disconnect(self.address)
+        # With IMMEDIATE the former pipe goes later, by ZeroMQ's own thread, and would swallow what is sent till then.
+        ends_s = time.monotonic() + LEAVE_S
+        while self.socket.poll(0, zmq.POLLOUT) and time.monotonic() < ends_s:
+            time.sleep(0.001)
+        self.address = address
+        if self._watch is not None:
+            self._watch.begin_anew(address)
+        try:
+            self.socket.connect(address)
+        except zmq.ZMQError as error:
             raise TransportError(f"{address}: cannot connect: {error.strerror}") from error
 
     def check(self) -> None:

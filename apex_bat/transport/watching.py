@@ -58,6 +58,12 @@ class HandshakeWatch:
         if self._reason:
             raise TransportError(f"{self._address}: authentication refused: {self._reason}")
 
+    def begin_anew(self, address: str) -> None:
+        """Forgets what the former server did: the socket goes to another address."""
+        while self._monitor.poll(0):
+            self._monitor.recv_multipart(zmq.NOBLOCK)
+        self._address, self._closed_in_a_row, self._reason = address, 0, ""
+
     def close(self) -> None:
         """Ends the watch; call it before the socket is closed."""
         self._socket.disable_monitor()

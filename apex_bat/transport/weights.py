@@ -193,6 +193,15 @@ class WeightsSubscriber:
         self._last = (weights.version, weights.learner_step)
         return weights
 
+    def redirect(self, address: str, generation: int) -> None:
+        """Listens to the publisher at another address from now on.
+
+        Raises:
+            TransportError: the address cannot be used.
+        """
+        self._connection.redirect(address)
+        self._generation = generation
+
     def wait(self, timeout_s: float) -> bool:
         """Waits until something has come, up to `timeout_s`; returns whether it has."""
         return bool(self._connection.socket.poll(int(timeout_s * 1000)))

@@ -9,13 +9,7 @@ from pathlib import Path
 import pytest
 
 from apex_bat.cli import main
-
-
-def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
-    """Runs a command in this process and returns its exit code and what it said on standard error."""
-    monkeypatch.setattr(sys, "argv", ["apex-bat", *arguments])
-    code = main()
-    return code, capsys.readouterr().err
+from tests.cli.conftest import Command, Refused
 
 
 @pytest.mark.parametrize(
@@ -28,7 +22,8 @@ def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         (["train", "--set", "network.strides=[20, 9]"], 2, "leave nothing of a row"),
         (["train", "--set", "transport.host=0.0.0.0"], 1, "not a loopback address, so it needs CURVE keys"),
         (["train", "--set", "transport.keys=nowhere"], 1, "nowhere"),
-        (["train", "--set", "replay.shards=2"], 2, "replay.shards is 2, and training starts one replay server"),
+        (["train", "--serial", "--set", "replay.shards=2"], 2, "replay.shards is 2, and a serial run has one replay"),
+        (["train", "--set", "replay.error_buffer=9"], 2, "replay.error_buffer 9 is too narrow"),
         (["train", "--set", "replay.capacity=600", "--set", "replay.min_size=100"], 2, "less than the 848 transitions"),
         (["train", "--set", "transport.max_message_mb=0.1"], 2, "less than the 0.83 MB"),
         (
@@ -63,39 +58,25 @@ def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     ],
 )
 def test_wrong_usage_is_one_clear_line_and_the_right_exit_code(
-    arguments: list[str],
-    code: int,
-    says: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
+    arguments: list[str], code: int, says: str, refused: Refused
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    result, error = run(arguments, monkeypatch, capsys)
-    assert result == code
-    assert says in error
-    assert "Traceback" not in error
-    assert not (tmp_path / "runs").exists(), "nothing was started"
+    refused(arguments, code, says)
 
 
-def test_an_unwritable_run_folder_is_named(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_an_unwritable_run_folder_is_named(command: Command, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    code, error = run(["train", "--run", str(tmp_path / "file" / "run")], monkeypatch, capsys)
+    code, error = command(["train", "--run", str(tmp_path / "file" / "run")])
     assert code == 1
     assert "the run folder cannot be written" in error
 
 
-def test_an_arena_without_safe_start_is_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_an_arena_without_safe_start_is_refused(command: Command, tmp_path: Path) -> None:
     walls = [
         [x, y, yaw, 1.0, 0.15, 1.0] for x, y, yaw in ((0, 0.5, 0), (0, -0.5, 0), (0.5, 0, 1.5708), (-0.5, 0, 1.5708))
     ]
     path = tmp_path / "cell.toml"
     path.write_text(f'name = "cell"\nstart = [0.0, 0.0]\nwalls = {json.dumps(walls)}\n')
-    code, error = run(["train", "--set", f"arena={path}"], monkeypatch, capsys)
+    code, error = command(["train", "--set", f"arena={path}"])
     assert code == 2
     assert "cell" in error
     assert "start" in error
@@ -126,13 +107,11 @@ def test_every_command_has_help(
     assert "Usage: " in capsys.readouterr().out
 
 
-def test_keys_are_made_once_and_only_for_their_owner(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_keys_are_made_once_and_only_for_their_owner(command: Command, tmp_path: Path) -> None:
     folder = tmp_path / "keys"
-    assert run(["keys", str(folder)], monkeypatch, capsys)[0] == 0
+    assert command(["keys", str(folder)])[0] == 0
     assert all(path.stat().st_mode & 0o077 == 0 for path in folder.iterdir())
-    code, error = run(["keys", str(folder)], monkeypatch, capsys)
+    code, error = command(["keys", str(folder)])
     assert code == 1
     assert str(folder) in error
 
@@ -164,10 +143,8 @@ def test_python_m_is_the_same_program(tmp_path: Path) -> None:
     assert output.startswith("apex-bat ")
 
 
-def test_a_further_client_gets_a_folder_of_its_own(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert run(["keys", str(tmp_path / "keys")], monkeypatch, capsys)[0] == 0
-    assert run(["keys", str(tmp_path / "keys"), "--client", str(tmp_path / "b")], monkeypatch, capsys)[0] == 0
+def test_a_further_client_gets_a_folder_of_its_own(command: Command, tmp_path: Path) -> None:
+    assert command(["keys", str(tmp_path / "keys")])[0] == 0
+    assert command(["keys", str(tmp_path / "keys"), "--client", str(tmp_path / "b")])[0] == 0
     assert not (tmp_path / "b" / "server.secret").exists()
     assert len((tmp_path / "keys" / "allowed_clients").read_text().split()) == 2

@@ -14,13 +14,14 @@ import pytest
 import typer
 from rich.console import Console
 
-from apex_bat.cli import main, reproducing
+from apex_bat.cli import reproducing
 from apex_bat.config import load
 from apex_bat.evaluation import runs
 from apex_bat.evaluation.reproduction import Planned, plan
-from apex_bat.launching import local
+from apex_bat.launching import course, local
 from apex_bat.launching.lock import InUseError, locked
 from apex_bat.storage import StorageError
+from tests.cli.conftest import Command, Refused
 
 SMALL = (
     "actors=1", "bats_per_actor=4", "sonar.rendering=exact", "replay.min_size=200", "replay.capacity=5_000",
@@ -31,18 +32,11 @@ SMALL = (
 )  # fmt: skip
 
 
-def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
-    monkeypatch.setattr(sys, "argv", ["apex-bat", *arguments])
-    code = main()
-    return code, capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
         (["reproduce", "--conditions", "memory,sight"], 2, "sight: no such condition; there are memory, "),
         (["reproduce", "--set", "replay.never_block=true"], 2, "samples per insert"),
-        (["reproduce", "--set", "replay.shards=2"], 2, "replay.shards"),
         (["reproduce", "--arenas", "labyrinth"], 2, "no such arena"),
         (["reproduce", "--arenas", "corridor:0-3"], 2, "one arena at a time"),
         (["reproduce", "--arenas", "simple,simple"], 2, "each once"),
@@ -59,20 +53,8 @@ def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         (["evaluate", "--policy", "ild", "--set", "episode.nonsense=1"], 2, "no such setting"),
     ],
 )
-def test_wrong_usage_starts_nothing(
-    arguments: list[str],
-    code: int,
-    says: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    result, error = run(arguments, monkeypatch, capsys)
-    assert result == code
-    assert says in error
-    assert "Traceback" not in error
-    assert not list(tmp_path.iterdir())
+def test_wrong_usage_starts_nothing(arguments: list[str], code: int, says: str, refused: Refused) -> None:
+    refused(arguments, code, says)
 
 
 @pytest.fixture
@@ -97,7 +79,7 @@ def test_what_another_process_trained_meanwhile_is_not_trained_again(
 
 @pytest.mark.parametrize(("outcome", "goes_on"), [("completed", True), ("interrupted", False)])
 def test_how_a_training_ended_is_noted_while_its_folder_is_locked(
-    outcome: local.Outcome, goes_on: bool, planned: Planned, monkeypatch: pytest.MonkeyPatch
+    outcome: course.Outcome, goes_on: bool, planned: Planned, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held: list[bool] = []
 
@@ -107,26 +89,24 @@ def test_how_a_training_ended_is_noted_while_its_folder_is_locked(
         held.append(True)
         raise StorageError("the disk is full")  # which is no reason to fail a training that is over
 
-    monkeypatch.setattr(local, "train", lambda *_, **__: local.Ended(outcome, "", 100, 10, 1.0))
+    monkeypatch.setattr(local, "train", lambda *_, **__: course.Ended(outcome, "", 100, 10, 1.0))
     monkeypatch.setattr(runs, "finish", finish)
     assert train(planned) is goes_on
     assert held == [True]
 
 
 def test_a_training_that_fails_ends_the_campaign(planned: Planned, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(local, "train", lambda *_, **__: local.Ended("failed", "actor-0 died", 100, 10, 1.0))
+    monkeypatch.setattr(local, "train", lambda *_, **__: course.Ended("failed", "actor-0 died", 100, 10, 1.0))
     with pytest.raises(typer.Exit):
         train(planned)
     assert json.loads((planned.folder / "run.json").read_text())["outcome"] == "failed"
 
 
-def test_a_baseline_is_evaluated_without_a_run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_baseline_is_evaluated_without_a_run(command: Command, tmp_path: Path) -> None:
     path = tmp_path / "out.json"
     arguments = ["evaluate", "--policy", "straight", "--arenas", "simple, circle", "--flights", "2", "--json",
                  str(path), "--set", "episode.evaluation_steps=30"]  # fmt: skip
-    assert run(arguments, monkeypatch, capsys)[0] == 0
+    assert command(arguments)[0] == 0
     result = json.loads(path.read_text())
     assert [row["arena"] for row in result["summary"]] == ["simple", "circle"]
     assert result["run"] == "straight"

@@ -3,8 +3,8 @@
 By hand, guided by coverage: `python -m tests.fuzz.fuzz_files [libFuzzer's options] [corpus folders]`, which wants
 atheris (the extra `fuzz`). The quick suite calls the same targets with what hypothesis makes up and with the corpus.
 
-The first byte of an input chooses the loader, the rest is the file. Recordings are left out: rerun's decoder, which is
-not ours, ends the whole process when it meets some kinds of damage.
+The first byte of an input chooses the loader, the rest is the file. Recordings are fuzzed apart, in `fuzz_recordings`:
+their decoder is not ours, and ends the whole process when it meets some kinds of damage.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ import pytest
 from apex_bat.config import Config
 from apex_bat.evaluation import runs
 from apex_bat.launching import local
+from apex_bat.launching.course import Course
 from apex_bat.launching.supervisor import Supervisor
 from apex_bat.replay.metrics import declared_name
 from apex_bat.roles.metrics import DECLARED
@@ -205,7 +206,7 @@ def test_ctrl_c_while_the_roles_of_a_complete_run_end_is_heard(
         def __enter__(self) -> None: ...
         def __exit__(self, *_: object) -> None: ...
 
-    monkeypatch.setattr(local._Launch, "follow", lambda *_: ("completed", ""))
+    monkeypatch.setattr(Course, "follow", lambda *_: ("completed", ""))
     monkeypatch.setattr(Supervisor, "stop", stop)
     run = tmp_path / "run"
     runs.create(run, Config())

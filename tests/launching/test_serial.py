@@ -6,6 +6,7 @@ import json
 import logging
 import signal
 import threading
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -13,9 +14,10 @@ from types import TracebackType
 import pytest
 
 from apex_bat.config import Config, ConfigError, load
-from apex_bat.launching import local, serial, serial_state
-from apex_bat.launching.local import Ended
+from apex_bat.launching import local, serial, serial_reports, serial_state
+from apex_bat.launching.course import Ended
 from apex_bat.launching.standing import Standing
+from apex_bat.launching.status import read_status
 from apex_bat.launching.supervisor import Watched
 from apex_bat.storage import StorageError
 
@@ -79,7 +81,7 @@ def test_a_closed_terminal_ends_a_run_unless_nohup_said_to_ignore_it(is_ignored:
         pytest.skip("this system has no SIGHUP")
     former = signal.signal(signal.SIGHUP, signal.SIG_IGN if is_ignored else signal.SIG_DFL)
     try:
-        with serial._stopping(threading.Event()) if is_serial else local._terminable():
+        with serial._stopping(threading.Event()) if is_serial else local.terminable():
             assert (signal.getsignal(signal.SIGHUP) == signal.SIG_IGN) is is_ignored
     finally:
         signal.signal(signal.SIGHUP, former)
@@ -245,3 +247,42 @@ def test_it_ends_at_the_limit_of_wall_clock_time(tmp_path: Path) -> None:
     ended = train(tmp_path / "run", "train.max_minutes=1e-9", "train.max_env_steps=none")
     assert ended.outcome == "completed"
     assert 0 < ended.env_steps < 450
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk_ends_no_run_and_changes_nothing_that_is_learned(
+    whole: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = folder(tmp_path / "run")
+    (run / "metrics" / "actor-0.jsonl").symlink_to("/dev/full")
+    (run / "serial").write_text("a file in the way of all saved states")
+    with caplog.at_level(logging.ERROR):
+        ended = serial.train(config(), run, NoView())
+    assert (ended.outcome, ended.env_steps) == ("completed", 450)
+    said = [record.message for record in caplog.records]
+    assert sum("actor-0.jsonl: cannot be written: No space left on device; training goes on" in s for s in said) == 1
+    assert sum("the state was not saved" in text for text in said) > 1, "it is tried again"
+    for name in content(whole):
+        if name.startswith("checkpoints/") or name == "metrics/learner.jsonl":
+            assert content(run)[name] == content(whole)[name]
+
+
+def test_the_status_is_kept_up_while_the_evaluator_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from apex_bat.evaluation import flights
+
+    monkeypatch.setattr(serial_reports, "STATUS_PERIOD_S", 0.0)
+    run, statuses = folder(tmp_path / "run"), []
+
+    def fly(*_: object, is_stopped: Callable[[], bool], **__: object) -> tuple[list[object], list[object]]:
+        for _step in range(3):
+            (run / "status.json").unlink()
+            assert not is_stopped()
+            statuses.append(read_status(run)["launcher"])
+        stop.set()
+        return [], []
+
+    monkeypatch.setattr(flights, "fly", fly)
+    with ExitStack() as stack:
+        stop = threading.Event()
+        serial.SerialRun(serial.settings_of(config()), run, stop, stack).follow(NoView())
+    assert statuses == ["runs"] * 3

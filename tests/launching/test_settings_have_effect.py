@@ -26,6 +26,8 @@ Measure = Callable[[Launch, Path], object]
 class Doomed:
     """A role that the test ends."""
 
+    waiting = ""
+
     def __init__(self) -> None:
         self.pid, self.ended = 1, threading.Event()
 

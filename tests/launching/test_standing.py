@@ -13,8 +13,8 @@ from apex_bat.roles.plan import roles_of
 from apex_bat.transport.messages import Report
 
 
-def report(role: str, metrics: dict[str, float] | None = None, pid: int = 1) -> Report:
-    return Report(role, pid, "here", "", "flying", metrics or {})
+def report(role: str, metrics: dict[str, float] | None = None, pid: int = 1, host: str = "here") -> Report:
+    return Report(role, pid, host, "", "flying", metrics or {})
 
 
 def standing_of(config: Config) -> Standing:
@@ -30,6 +30,8 @@ def test_counters_add_up_over_actors_and_over_restarts() -> None:
     standing.take(report("actor-0", {"env_steps": 150}), 2.0)
     standing.take(report("actor-0", {"env_steps": 7}, pid=2), 3.0)
     assert standing.env_steps == 167
+    standing.take(report("actor-0", {"env_steps": 3}, pid=2, host="there"), 4.0)
+    assert standing.env_steps == 170, "in containers process numbers are the same everywhere"
 
 
 def test_time_runs_from_the_first_environment_step() -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pytest
 
 from apex_bat.config.settings import Launch
-from apex_bat.launching.supervisor import Exit, RoleFailedError, Supervisor
+from apex_bat.launching.supervisor import Exit, RoleFailedError, Supervisor, describe
 from apex_bat.roles.plan import Role
 
 ACTOR = Role("actor", 0)
@@ -18,6 +18,7 @@ class Puppet:
 
     pid: int
     ended: Exit | None = None
+    waiting: str = ""
     is_asked: bool = False
 
     def poll(self) -> Exit | None:
@@ -35,6 +36,7 @@ class Stage:
 
     def __init__(self, launch: Launch | None = None, errors: list[OSError] | None = None) -> None:
         self.errors = errors or []
+        self.waiting = ""
         self.puppets: list[Puppet] = []
         self.incarnations: list[int] = []
         self.supervisor = Supervisor([ACTOR], self.start, launch or Launch())
@@ -46,7 +48,7 @@ class Stage:
         if self.errors:
             raise self.errors.pop()
         self.incarnations.append(incarnation)
-        self.puppets.append(Puppet(pid=100 + len(self.puppets)))
+        self.puppets.append(Puppet(pid=100 + len(self.puppets), waiting=self.waiting))
         return self.puppets[-1]
 
     def fail(self, now_s: float, code: int = 1) -> None:
@@ -270,3 +272,38 @@ def test_a_role_that_is_never_heard_is_given_up() -> None:
     with pytest.raises(RoleFailedError, match="given up after 3 quick failures"):
         stage.look_until(200.0)
     assert len(stage.puppets) == 3
+
+
+def test_a_role_that_waits_for_a_place_is_not_silent_and_not_given_up() -> None:
+    stage = Stage(Launch(start_timeout_s=10.0))
+    stage.puppets[0].waiting = "waiting for a place"
+    stage.look_until(1000.0)
+    assert stage.puppets[0].ended is None
+    stage.puppets[0].waiting = ""
+    stage.look_until(1009.0)
+    assert stage.puppets[0].ended is None, "it has as long to begin as any other, from when it had its place"
+    stage.look_until(1012.0)
+    assert stage.puppets[0].ended is not None
+
+
+def test_a_role_that_was_lost_with_its_machine_has_not_failed() -> None:
+    stage = Stage(Launch(max_failures=0))
+    for now_s in range(1, 40):
+        stage.puppets[-1].ended = Exit(-9, "host1: it died", is_lost=True)
+        stage.look_until(60.0 * now_s)
+    assert len(stage.puppets) > 20
+    assert stage.supervisor.watched["actor-0"].failures_in_a_row == 0
+    assert "lost with its machine: host1: it died" in describe(Exit(-9, "host1: it died", is_lost=True))
+
+
+def test_the_wait_grows_while_no_place_lets_a_role_begin() -> None:
+    stage, waits = Stage(Launch(backoff_s=1.0)), []
+    stage.waiting = "waiting for a place"
+    for _ in range(4):
+        stage.puppets[-1].ended = Exit(None, "no memory there")
+        stage.look_until(stage.now_s + 0.5)
+        due_s = stage.supervisor.watched["actor-0"].due_s
+        assert due_s is not None
+        waits.append(due_s - stage.now_s)
+        stage.look_until(due_s)
+    assert waits == [1.0, 2.0, 4.0, 8.0]

@@ -71,3 +71,26 @@ def test_a_row_that_finds_no_room_for_its_end_leaves_nothing(tmp_path: Path) -> 
     writer.append(REPORT, elapsed_s=3.5, env_steps=12, learner_step=3)
     writer.close()
     assert [json.loads(line)["env_steps_total"] for line in path.read_text().splitlines()] == [10, 12]
+
+
+@pytest.mark.parametrize("torn", [b'{"unix_s": 1.5, "rol', b"{"])
+def test_the_row_after_a_torn_one_is_not_lost_with_it(torn: bytes, tmp_path: Path) -> None:
+    whole = b'{"unix_s": 1.0}\n'
+    (tmp_path / "actor-0.jsonl").write_bytes(whole + torn)
+    writer = MetricsWriter(tmp_path)
+    for elapsed_s in (1.5, 2.5):
+        writer.append(REPORT, elapsed_s=elapsed_s, env_steps=10, learner_step=3)
+    writer.close()
+    lines = (tmp_path / "actor-0.jsonl").read_bytes().splitlines()
+    assert lines[:2] == [whole.rstrip(), torn]
+    assert [json.loads(line)["elapsed_s"] for line in lines[2:]] == [1.5, 2.5]
+
+
+def test_rows_of_a_file_that_goes_on_follow_without_an_empty_line(tmp_path: Path) -> None:
+    for elapsed_s in (1.5, 2.5):
+        writer = MetricsWriter(tmp_path)
+        writer.append(REPORT, elapsed_s=elapsed_s, env_steps=10, learner_step=3)
+        writer.close()
+    lines = (tmp_path / "actor-0.jsonl").read_bytes().split(b"\n")
+    assert [json.loads(line)["elapsed_s"] for line in lines[:-1]] == [1.5, 2.5]
+    assert lines[-1] == b""

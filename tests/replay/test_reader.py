@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -141,32 +142,47 @@ def test_it_goes_on_with_the_next_server_at_the_same_address(
         second.close()
 
 
-def test_several_servers_give_items_that_find_their_way_back(
+def test_several_servers_are_drawn_from_as_one_and_priorities_find_their_way_back(
     free_running: Config, make_chunk: MakeChunk, until: Until
 ) -> None:
-    servers = [ReplayServer(free_running, "tcp://127.0.0.1:0", np.random.default_rng(i)) for i in range(2)]
-    for server in servers:
-        server.store.add("a", 0, [make_chunk(40)])
-    reader = ReplayReader([server.address for server in servers], 16, 4)
+    servers = [
+        ReplayServer(free_running, "tcp://127.0.0.1:0", np.random.default_rng(i), generation=7 + i) for i in range(2)
+    ]
+    priorities = np.zeros(80)
+    for number, server in enumerate(servers):
+        chunk = make_chunk(40)
+        chunk = chunk._replace(priorities=(0.2 + (1 + 4 * number) * chunk.priorities).astype(np.float32))
+        server.store.add("a", 0, [chunk])
+        priorities[number::2] = chunk.priorities
+    addresses, generator = [server.address for server in servers], np.random.default_rng(5)
+    reader = ReplayReader(addresses, 16, 4, generation=[7, 8], generator=generator)
 
-    def serve_both() -> None:
-        for server in servers:
-            server.serve(0.001)
+    def drawn(number: int) -> list[Batch]:
+        got: list[Batch] = []
+
+        def step() -> None:
+            for server in servers:
+                server.serve(0.0)
+            batch = reader.next(0.001)
+            got.extend([] if batch is None else [batch])
+
+        until(lambda: len(got) >= number, step)
+        return got
 
     try:
-        seen: set[int] = set()
-        for _ in range(20):
-            until(lambda: reader.counters()["reader.ready"], serve_both)
-            batch = reader.next(1.0)
-            assert batch is not None
-            assert len(set(batch.items % 2)) == 1
-            seen |= set((batch.items % 2).tolist())
-        assert seen == {0, 1}
-        reader.update(np.array([2 * 7 + 1, 2 * 5]), np.array([3.0, 2.0], np.float32))
-        until(lambda: all(server.metrics()["replay.updated_priorities"] for server in servers), serve_both)
-        stored = [server.store.buffer.item_arrays()["items"]["priority"] for server in servers]
-        assert stored[1][7] == pytest.approx(3.0, abs=1e-4)
-        assert stored[0][5] == pytest.approx(2.0, abs=1e-4)
+        drawn(6)
+        reader.update(np.array([2 * 7 + 1, 2 * 5]), np.array([3.0, 9.0], np.float32))
+        priorities[[15, 10]] = 3.0, 9.0
+        until(
+            lambda: all(server.metrics()["replay.updated_priorities"] for server in servers),
+            *(functools.partial(server.serve, 0.001) for server in servers),
+        )
+        drawn(10)  # those drawn before the update
+        items = np.concatenate([batch.items for batch in drawn(500)])
+        expected = priorities / priorities.sum() * len(items)
+        chi_square = ((np.bincount(items, minlength=80) - expected) ** 2 / expected).sum()
+        assert chi_square < 125  # 0.1 % of 79 degrees of freedom; stratified draws lie below a chi-square
+        assert reader.counters()["reader.servers_away"] == 0
     finally:
         reader.close()
         for server in servers:
@@ -206,7 +222,7 @@ def test_requests_that_were_lost_go_again_although_others_are_answered(
 ) -> None:
     with closing(ReplayReader(address, 16, 8, ask_again_s=60.0)) as reader:
         until(lambda: server.metrics()["replay.queued_requests"] == 8, lambda: server.serve(0.0))
-        requests = server._requests  # lost here stands for lost on the way
+        requests = server._outlet.requests  # lost here stands for lost on the way
         for _ in range(5):
             requests.take()
         server.store.add("a", 0, [make_chunk(40)])
@@ -223,3 +239,19 @@ def test_what_ends_the_thread_is_raised_instead_of_waited_for(reader: ReplayRead
 def test_priorities_that_do_not_fit_their_items_are_refused(reader: ReplayReader) -> None:
     with pytest.raises(ValueError, match="3 priorities for 2 items"):
         reader.update(np.arange(2), np.zeros(3, np.float32))
+
+
+def test_what_is_outstanding_is_asked_for_at_the_server_at_another_address(
+    server: ReplayServer, free_running: Config, tmp_path: Path, address: str, make_chunk: MakeChunk, until: Until
+) -> None:
+    reader = ReplayReader(address, batch_size=16, prefetch=3, ask_again_s=1000.0)
+    successor = ReplayServer(free_running, f"ipc://{tmp_path}/s", np.random.default_rng(1), generation=2)
+    try:
+        until(lambda: server.metrics()["replay.queued_requests"] == 3, lambda: server.serve(0.01))
+        successor.store.add("a", 0, [make_chunk(40)])
+        reader.redirect(successor.address, 2)
+        batches(successor, reader, 10)
+        assert not successor.metrics()["replay.refused_messages"]
+    finally:
+        reader.close()
+        successor.close()

@@ -18,6 +18,7 @@ from apex_bat.experience import Chunk
 from apex_bat.replay import snapshot
 from apex_bat.replay.buffer import ReplayBuffer
 from apex_bat.replay.snapshot import SnapshotError, SnapshotWriter, previous_of, read_snapshot
+from apex_bat.replay.verification import verify
 
 MakeChunk = Callable[..., Chunk]
 
@@ -192,3 +193,62 @@ def test_a_forged_header_is_refused_and_the_file_before_is_used(
     forged(path, change)
     assert read_snapshot(path, restored)[1] == previous_of(path)
     assert len(restored) == 10
+
+
+@pytest.mark.parametrize("is_damaged", [False, True], ids=["the newest is whole", "the newest is damaged"])
+@pytest.mark.parametrize("renames_done", [0, 1])
+def test_a_kill_before_each_rename_leaves_a_sound_snapshot(
+    renames_done: int, is_damaged: bool, tmp_path: Path, make_chunk: MakeChunk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, buffer, restored = tmp_path / "replay", new_buffer(), new_buffer()
+    for _ in range(2):
+        add(buffer, make_chunk(10))
+        save(buffer, path)
+    if is_damaged:
+        path.write_bytes(path.read_bytes()[:-100])
+    add(buffer, make_chunk(10))
+    kill_before_rename(monkeypatch, renames_done)
+    with pytest.raises(OSError, match="killed"):
+        save(buffer, path)
+    monkeypatch.undo()
+    monkeypatch.setattr(snapshot, "SLICE_ROWS", 64)
+    _, used = read_snapshot(path, restored)
+    assert len(restored) == {(0, False): 20, (0, True): 10, (1, False): 30, (1, True): 30}[renames_done, is_damaged]
+    facts = verify(path)
+    assert facts is not None
+    assert facts.path == used, "what is said to be restored is what is restored"
+    assert facts.transitions == len(restored)
+    save(restored, path)
+    assert read_snapshot(path, new_buffer())[1] == path, "the run goes on from there"
+
+
+def kill_before_rename(monkeypatch: pytest.MonkeyPatch, renames_left: int) -> None:
+    """Ends the writing before one of its renames; nothing is removed after it, as by a process that is no more."""
+    rename = Path.replace
+
+    def replace(self: Path, target: Path) -> Path:
+        nonlocal renames_left
+        if renames_left == 0:
+            raise OSError("killed")
+        renames_left -= 1
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "replace", replace)
+    monkeypatch.setattr(Path, "unlink", lambda *_, **__: None)
+
+
+def test_a_first_snapshot_that_was_cut_off_is_none(tmp_path: Path) -> None:
+    (tmp_path / "replay.writing").write_bytes(b"half")
+    with pytest.raises(FileNotFoundError, match="no snapshot"):
+        read_snapshot(tmp_path / "replay", new_buffer())
+
+
+def test_one_that_was_cut_off_while_no_newest_stands_gives_way_to_the_one_before(
+    tmp_path: Path, make_chunk: MakeChunk
+) -> None:
+    buffer, restored = new_buffer(), new_buffer()
+    add(buffer, make_chunk(10))
+    save(buffer, tmp_path / "replay")
+    (tmp_path / "replay").replace(previous_of(tmp_path / "replay"))
+    (tmp_path / "replay.writing").write_bytes(b"half")
+    assert read_snapshot(tmp_path / "replay", restored)[1] == previous_of(tmp_path / "replay")

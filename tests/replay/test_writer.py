@@ -206,26 +206,6 @@ def test_bytes_that_are_no_message_are_counted(make_chunk: MakeChunk, until: Unt
         context.destroy(linger=0)
 
 
-def test_an_actor_always_chooses_the_same_of_several_servers(free_running: Config, make_chunk: MakeChunk) -> None:
-    servers = [serving(free_running, "tcp://127.0.0.1:0") for _ in range(2)]
-    writers = [ReplayWriter([s.address for s in servers], f"actor{i}", 4) for i in range(8)]
-    try:
-        for writer in writers:
-            writer.send([make_chunk(10)], 0)
-        for writer in writers:
-            while not writer.flush(0.01):
-                for server in servers:
-                    server.serve(0.0)
-        inserted = [server.metrics()["replay.inserted"] for server in servers]
-        assert sum(inserted) == 80
-        assert min(inserted) > 0
-    finally:
-        for writer in writers:
-            writer.close()
-        for server in servers:
-            server.close()
-
-
 def test_what_a_server_said_before_it_fell_silent_is_no_longer_the_reason(
     config: Config, address: str, make_chunk: MakeChunk, until: Until
 ) -> None:
@@ -248,3 +228,20 @@ def test_what_a_server_said_before_it_fell_silent_is_no_longer_the_reason(
     finally:
         server.close()
         writer.close()
+
+
+def test_what_is_unacknowledged_goes_to_the_server_at_another_address(
+    free_running: Config, tmp_path: Path, address: str, make_chunk: MakeChunk, until: Until
+) -> None:
+    writer = ReplayWriter(address, "a", window_chunks=4, generation=1, resend_s=1000.0)
+    successor = ReplayServer(free_running, f"ipc://{tmp_path}/s", np.random.default_rng(0), generation=2)
+    try:
+        writer.send([make_chunk(10)], 0)
+        writer.send([make_chunk(10)], 0)
+        writer.redirect(successor.address, 2)
+        until(lambda: not writer.unacknowledged, lambda: writer.poll(0.0), lambda: successor.serve(0.01))
+        assert successor.metrics()["replay.inserted"] == 20
+        assert not successor.metrics()["replay.refused_messages"]
+    finally:
+        writer.close()
+        successor.close()

@@ -2,80 +2,31 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from apex_bat.agent.exploration import ladder_of_actor
-from apex_bat.agent.network import DuelingNetwork, parameters_of
-from apex_bat.config import Config, load
+from apex_bat.config import load
 from apex_bat.experience import Chunk
 from apex_bat.recording.catalog import list_flights
 from apex_bat.recording.reading import read_flight
 from apex_bat.roles.actor import Actor
-from apex_bat.roles.plan import Addresses, Assignment, Role
+from apex_bat.roles.plan import Role
 from apex_bat.roles.reporting import RoleReporter
-from apex_bat.transport.messages import Weights
+from tests.roles.fakes import LEARNER_STEP, FakeReplay, FakeWeights, assignment
 
 SMALL = ("network.channels=[4]", "network.strides=[3]", "network.hidden=[8]", "bats_per_actor=3", "actors=2",
          "actor.chunk_transitions=10", "sonar.rendering=exact", "episode.training_steps=12")  # fmt: skip
 
 
-class Replay:
-    """Keeps the chunks."""
-
-    waiting = ""
-    has_room = True
-
-    def __init__(self) -> None:
-        self.chunks: list[Chunk] = []
-
-    def send(self, chunks: Sequence[Chunk], learner_step: int) -> None:
-        assert learner_step >= 0
-        self.chunks += chunks
-
-    def poll(self, timeout_s: float) -> None:
-        del timeout_s
-
-    def flush(self, timeout_s: float) -> bool:
-        return timeout_s >= 0.0
-
-    def counters(self) -> dict[str, float]:
-        return {}
-
-    def close(self) -> None:
-        return None
-
-
-class WeightsOnce:
-    """Gives the weights of an untrained network."""
-
-    def __init__(self, config: Config) -> None:
-        torch.manual_seed(0)
-        self._arrays = parameters_of(DuelingNetwork(config.network, config.state_steps))
-
-    def newest(self) -> Weights:
-        return Weights(1, 5, self._arrays)
-
-    def wait(self, timeout_s: float) -> bool:
-        return timeout_s >= 0.0
-
-    def close(self) -> None:
-        return None
-
-
 def fly(folder: Path, *changes: str, number: int = 0, steps: int = 40) -> list[Chunk]:
     """The chunks of some steps of an actor."""
     config = load(None, [*SMALL, *changes])
-    addresses = Addresses(*(f"ipc://{folder}/{name}" for name in ("replay", "weights", "reports")))
-    assignment = Assignment(Role("actor", number), config, folder, addresses, threading.Event(), 0)
-    replay = Replay()
-    with closing(RoleReporter(assignment)) as reporter:
-        actor = Actor(assignment, replay, WeightsOnce(config), reporter)
+    whole, replay = assignment(config, folder, Role("actor", number)), FakeReplay()
+    with closing(RoleReporter(whole)) as reporter:
+        actor = Actor(whole, replay, FakeWeights(config), reporter)
         with closing(actor):
             for _ in range(steps):
                 assert actor.is_ready(0.0)
@@ -96,7 +47,7 @@ def test_recorded_flight_is_the_one_that_trains(tmp_path: Path) -> None:
     chunks = fly(tmp_path, "recording.every_episodes=100")
     (entry,) = list_flights(tmp_path)
     flight = read_flight(entry.path)
-    assert (flight.facts.kind, flight.facts.actor, flight.facts.checkpoint_step) == ("training", 0, 5)
+    assert (flight.facts.kind, flight.facts.actor, flight.facts.checkpoint_step) == ("training", 0, LEARNER_STEP)
     assert any(
         chunk.first_step == 0
         and len(chunk.frames) >= flight.num_steps

@@ -6,12 +6,9 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from apex_bat.config import Config, load
-from apex_bat.experience import Batch, States
 from apex_bat.roles import checkpoint
 from apex_bat.roles.learner import Learner, make_agent, new_agent
 from apex_bat.roles.plan import Addresses, Assignment, Role
@@ -19,36 +16,10 @@ from apex_bat.roles.reporting import RoleReporter
 from apex_bat.roles.serial import WeightsBoard
 from apex_bat.storage import digest
 from apex_bat.transport.messages import Report
+from tests.roles.fakes import Batches
 
 SMALL = ("network.channels=[4]", "network.strides=[3]", "network.hidden=[8]", "learner.batch_size=16",
          "learner.target_period=30", "learner.learning_rate=0.005")  # fmt: skip
-
-
-class Batches:
-    """Gives the same batches, in order, to whoever begins at the same number."""
-
-    waiting = ""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-    def next(self, timeout_s: float) -> Batch:
-        assert timeout_s >= 0.0
-        generator = np.random.default_rng(self.number)
-        self.number += 1
-        actions = generator.integers(0, 3, (16, 3)).astype(np.uint8)
-        states, next_states = (States(generator.random((16, 6, 24), np.float32), actions) for _ in range(2))
-        numbers = generator.random((3, 16), np.float32)
-        return Batch(np.arange(16), numbers[0], states, actions[:, 0], numbers[1], 0.9 * numbers[2], next_states)
-
-    def update(self, items: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
-        assert items.shape == priorities.shape
-
-    def counters(self) -> dict[str, float]:
-        return {}
-
-    def close(self) -> None:
-        return None
 
 
 class Reports:

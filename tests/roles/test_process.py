@@ -13,9 +13,14 @@ import pytest
 
 from apex_bat.config import load
 from apex_bat.config.loading import dumps
+from apex_bat.evaluation import runs
 from apex_bat.launching.processes import RoleProcess, remove_unfinished
-from apex_bat.roles.plan import Role
-from apex_bat.roles.resources import began_unix_s, is_same_process
+from apex_bat.roles.orders import line_of
+from apex_bat.roles.plan import Addresses, Role
+from apex_bat.roles.resources import began_unix_s
+from apex_bat.transport.messages import Report
+from apex_bat.transport.reports import ReportCollector
+from apex_bat.transport.security import new_keys
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals and sessions are POSIX")
 
@@ -168,8 +173,33 @@ def test_what_a_killed_process_was_writing_is_removed_and_nothing_else(run: Path
     assert not others[1].exists()
 
 
-def test_another_process_with_the_same_number_is_not_taken_for_the_one_noted() -> None:
-    began = began_unix_s(os.getpid())
-    assert began is not None
-    assert is_same_process(os.getpid(), began)
-    assert not is_same_process(os.getpid(), began - 60.0)
+def test_a_role_takes_addresses_and_keys_from_its_leash_and_leaves_no_key_behind(tmp_path: Path) -> None:
+    """The evaluator, which needs the launcher only: its report comes by the keys that went through the pipe."""
+    config, keys = load(None, ["actors=1"]), new_keys()
+    runs.create(tmp_path / "run", config)
+    collector = ReportCollector("tcp://127.0.0.1:0", keys=keys, generation=9)
+    orders = line_of(Addresses("", "", collector.address, reports_generation=9), keys.of_client())
+    process = RoleProcess(Role("evaluator", 0), tmp_path / "run", 0, 1, orders=orders, folder=tmp_path)
+    try:
+        reports: list[Report] = []
+
+        def has_reported() -> bool:
+            reports.extend(collector.poll(0.1))
+            return bool(reports)
+
+        eventually(has_reported, 60.0, "it reports")
+        assert reports[0].pid == process.pid
+        secret = keys.client_secret
+        if sys.platform == "linux":
+            proc = Path(f"/proc/{process.pid}")
+            assert secret not in (proc / "cmdline").read_bytes()
+            assert secret not in (proc / "environ").read_bytes()
+        process.stop()
+        eventually(lambda: process.poll() is not None, 20.0, "it ends with its leash")
+        ended = process.poll()
+        assert ended is not None
+        assert ended.code == 0
+        assert not [path for path in tmp_path.rglob("*") if path.is_file() and secret in path.read_bytes()]
+    finally:
+        process.kill()
+        collector.close()

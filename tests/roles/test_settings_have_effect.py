@@ -6,7 +6,7 @@ The tables below name every field of these sections; a new field without a case 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,12 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from apex_bat.agent.d3qn import D3QN
 from apex_bat.agent.exploration import annealed, ladder_of_actor
 from apex_bat.agent.inference import parameter_shapes
 from apex_bat.agent.n_step import Accumulator
-from apex_bat.agent.network import DuelingNetwork, parameters_of
+from apex_bat.agent.network import DuelingNetwork
 from apex_bat.config import Config, load, settings
 from apex_bat.experience import Batch, Chunk, States
 from apex_bat.replay.server import ReplayServer
@@ -28,20 +27,15 @@ from apex_bat.replay.store import ReplayStore
 from apex_bat.replay.writer import ReplayWriter
 from apex_bat.roles.actor import Actor
 from apex_bat.roles.learner import Learner
-from apex_bat.roles.plan import Addresses, Assignment, Role
+from apex_bat.roles.plan import Role
 from apex_bat.roles.reporting import RoleReporter
-from apex_bat.transport.messages import Weights
+from tests.roles.fakes import Batches, FakeReplay, FakeWeights, assignment
 
 BASE = (
     "network.channels=[4]", "network.strides=[3]", "network.hidden=[8]", "learner.batch_size=16", "bats_per_actor=4",
     "replay.capacity=400", "replay.min_size=100", "actor.chunk_transitions=10", "sonar.rendering=exact",
 )  # fmt: skip
 Measure = Callable[[Config, Path], object]
-
-
-def assignment(config: Config, folder: Path, role: Role) -> Assignment:
-    addresses = Addresses(*(f"ipc://{folder}/{name}" for name in ("replay", "weights", "reports")))
-    return Assignment(role, config, folder, addresses, threading.Event(), 0)
 
 
 def batch_of(size: int) -> Batch:
@@ -89,67 +83,6 @@ def explored(config: Config, _: Path) -> object:
     return ladder_of_actor(0, 2, 4, part).tolist(), ladder_of_actor(0, 1, 1, part).tolist(), annealing
 
 
-class FakeReplay:
-    """Takes chunks and gives batches at once; notes what is asked of it."""
-
-    waiting = ""
-    has_room = True
-
-    def __init__(self) -> None:
-        self.chunks: list[Chunk] = []
-
-    def send(self, chunks: Sequence[Chunk], learner_step: int) -> None:
-        assert learner_step >= 0
-        self.chunks += chunks
-
-    def poll(self, timeout_s: float) -> None:
-        del timeout_s
-
-    def flush(self, timeout_s: float) -> bool:
-        del timeout_s
-        return True
-
-    def next(self, timeout_s: float) -> Batch:
-        del timeout_s
-        return batch_of(16)
-
-    def update(self, items: NDArray[np.int64], priorities: NDArray[np.float32]) -> None:
-        assert items.shape == priorities.shape
-
-    def counters(self) -> dict[str, float]:
-        return {}
-
-    def close(self) -> None:
-        return None
-
-
-class FakeWeights:
-    """Gives weights whenever asked, takes those broadcast, and counts both."""
-
-    def __init__(self, config: Config) -> None:
-        torch.manual_seed(0)
-        self._arrays = parameters_of(DuelingNetwork(config.network, config.state_steps))
-        self.num_asked = self.num_published = 0
-
-    def newest(self) -> Weights:
-        self.num_asked += 1
-        return Weights(self.num_asked, self.num_asked, self._arrays)
-
-    def wait(self, timeout_s: float) -> bool:
-        del timeout_s
-        return True
-
-    def publish(self, version: int, learner_step: int, arrays: Mapping[str, NDArray[np.float32]]) -> None:
-        del version, learner_step, arrays
-        self.num_published += 1
-
-    def serve(self) -> None:
-        return None
-
-    def close(self) -> None:
-        return None
-
-
 def flown(config: Config, folder: Path) -> object:
     """Flies 60 steps: the actions taken, and how often weights were asked for."""
     whole = assignment(config, folder, Role("actor", 0))
@@ -166,7 +99,7 @@ def broadcast(config: Config, folder: Path) -> int:
     """Broadcasts of weights within 30 updates."""
     whole = assignment(config, folder, Role("learner", 0))
     weights, reporter = FakeWeights(config), RoleReporter(whole)
-    learner = Learner(whole, D3QN(config, torch.device("cpu")), 0, FakeReplay(), weights, reporter)
+    learner = Learner(whole, D3QN(config, torch.device("cpu")), 0, Batches(0), weights, reporter)
     for _ in range(30):
         learner.step(0.0)
     reporter.close()
@@ -188,8 +121,8 @@ def requested(config: Config, folder: Path) -> object:
         while rounds_left:  # some more after the first request, in which no further ones may come
             server.serve(0.1)
             rounds_left = min(rounds_left - 1, 5 if server.metrics()["replay.queued_requests"] else 100)
-        waiting = server._requests.peek()
-        return server.metrics()["replay.queued_requests"], waiting and waiting.batch_size
+        waiting = server._outlet.requests.peek()
+        return server.metrics()["replay.queued_requests"], getattr(waiting, "batch_size", None)
     finally:
         whole.stop.set()
         thread.join(20)

@@ -17,12 +17,14 @@ from apex_bat.transport.messages import (
     InsertHeader,
     Message,
     MessageError,
+    PartRequest,
     PriorityUpdate,
     Ratio,
     RatioChange,
     Report,
     Sample,
     SampleRequest,
+    Standing,
     Waiting,
     Weights,
     decode,
@@ -66,6 +68,9 @@ MESSAGES: list[Message] = [
     Waiting("for actors"),
     SampleRequest(1, 512, 9),
     Sample(1, batch()),
+    PartRequest(3, 0, 64, 9),
+    Standing(3, 500, 12.5, 90, 0.4, 1.5, "for actors"),
+    Sample(3, batch(), Standing(3, 500, 12.5, 90, 0.4, 1.5)),
     PriorityUpdate(4, np.arange(3), np.array([0.5, -1.0, 2.0], np.float32)),
     RatioChange(2.5),
     Ratio(2.5, 800.0, "because"),
@@ -155,6 +160,8 @@ def test_starts_may_begin_anew_in_the_next_chunk() -> None:
     ("message", "why"),
     [
         (Sample(1, batch()._replace(weights=np.full(5, np.nan, np.float32))), "weights"),
+        (Standing(1, 5, float("nan"), 0, 0.4), "number|float|finite|range"),
+        (Sample(1, batch(), Standing(1, 5, 1.0, 0, 0.4, float("inf"))), "number|float|finite|range"),
         (Sample(1, batch()._replace(actions=np.full(5, 3, np.uint8))), "actions"),
         (PriorityUpdate(1, np.array([-1]), np.array([1.0], np.float32)), "items"),
         (PriorityUpdate(1, np.array([1]), np.array([np.nan], np.float32)), "priorities"),
@@ -172,8 +179,8 @@ def test_another_generation_or_protocol_is_refused() -> None:
     assert decode(data, 4) == decode(data) == Ack(1, 1)
     with pytest.raises(MessageError, match="generation: 4, this address has 5"):
         decode(data, 5)
-    data[4] = 2
-    with pytest.raises(MessageError, match="protocol: version 2, this side speaks 1"):
+    data[4] = 1
+    with pytest.raises(MessageError, match="protocol: version 1, this side speaks 2"):
         decode(data, 4)
 
 

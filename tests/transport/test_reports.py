@@ -85,3 +85,20 @@ def test_a_flood_is_refused_by_reason_and_a_poll_still_ends(monkeypatch: pytest.
     finally:
         stranger.close()
         collector.close()
+
+
+def test_what_a_former_life_of_a_role_still_says_is_refused() -> None:
+    """A node that was cut off delivers, when it is back, what its role said meanwhile."""
+    collector = ReportCollector("tcp://127.0.0.1:0", generation=1)
+    former, present = (Reporter(collector.address, generation=number) for number in (5, 6))
+    try:
+        collector.generations["actor"] = 6
+        assert delivered(former, collector, report()) == []
+        assert collector.refusals.counts["generation"] == 1
+        assert delivered(present, collector, report()) == [report()]
+        other = msgspec.structs.replace(report(), role="other")
+        assert delivered(present, collector, other) == [], "others go by the generation of the address"
+    finally:
+        former.close()
+        present.close()
+        collector.close()

@@ -47,6 +47,24 @@ def test_what_is_no_address_is_refused(address: str) -> None:
         check_address(address, SOME_KEYS)
 
 
+def test_a_connection_that_is_redirected_leaves_the_one_and_goes_to_the_other() -> None:
+    former, next_one = (Listener(zmq.PULL, "tcp://127.0.0.1:0") for _ in range(2))
+    connection = Connection(zmq.PUSH, former.address)
+    try:
+        connection.socket.send(b"1")
+        assert former.socket.poll(10_000)
+        connection.redirect(next_one.address)
+        assert connection.address == next_one.address
+        connection.socket.send(b"2")
+        assert next_one.socket.poll(10_000)
+        assert next_one.socket.recv() == b"2"
+        with pytest.raises(TransportError, match="needs CURVE keys"):
+            connection.redirect("tcp://192.0.2.1:5000")
+    finally:
+        for each in (connection, former, next_one):
+            each.close()
+
+
 @pytest.mark.parametrize("host", ["10.0.0.1", "localhost.example.org", "128.0.0.1"])
 def test_other_hosts_are_not_loopback(host: str) -> None:
     assert not is_loopback(host)

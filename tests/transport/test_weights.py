@@ -234,3 +234,20 @@ def test_a_large_subscription_ends_the_connection(publisher: WeightsPublisher) -
         assert publisher.refusals.total == 0
     finally:
         stranger.close()
+
+
+def test_a_subscriber_follows_a_publisher_to_another_address_and_generation(
+    publisher: WeightsPublisher, subscriber: WeightsSubscriber
+) -> None:
+    publisher.publish(1, 25, arrays(1))
+    assert arrival(publisher, subscriber).version == 1
+    successor = WeightsPublisher("tcp://127.0.0.1:0", generation=7)
+    try:
+        successor.publish(2, 50, arrays(2))
+        subscriber.redirect(successor.address, 7)
+        assert arrival(successor, subscriber).version == 2
+        publisher.publish(3, 75, arrays(3))  # what the former one still says is not heard
+        successor.publish(4, 100, arrays(4))
+        assert arrival(successor, subscriber).version == 4
+    finally:
+        successor.close()

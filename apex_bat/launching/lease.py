@@ -1,0 +1,61 @@
+"""The lease on which a role lives on another machine: it ends there before a replacement begins elsewhere.
+
+The launcher looks at each keeper about twice a second and says which answer it has seen last. The keeper counts its
+lease from when it *gave* that answer, by its own clock; the launcher from when it *received* one, by its own. As an
+answer is received after it was given, the keeper's lease always ends first, whatever the two clocks show and however
+long a look was under way: one that a network delivers after a cut of minutes names an old answer and prolongs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+MARGIN_S = 0.5
+"""What the launcher waits beyond: for the keeper's kill to be done, and for clocks that run unequally fast."""
+
+
+class Lease:
+    """The keeper's end."""
+
+    def __init__(self, lease_s: float, clock: Callable[[], float]) -> None:
+        """Begins now; `clock` gives seconds, never backwards."""
+        self._lease_s, self._clock = lease_s, clock
+        self._given_s = {0: clock()}
+        self._ends_s = self._given_s[0] + lease_s
+        self._number = 0
+
+    def answer(self, seen: int) -> int:
+        """Notes a look by which the launcher has seen answer `seen`; returns the number of the answer to it."""
+        given_s = self._given_s.get(seen)
+        if given_s is not None:
+            self._ends_s = max(self._ends_s, given_s + self._lease_s)
+        self._given_s = {number: at_s for number, at_s in self._given_s.items() if number >= seen}
+        self._number += 1
+        self._given_s[self._number] = self._clock()
+        return self._number
+
+    @property
+    def has_lapsed(self) -> bool:
+        """Whether it is over, until the launcher is heard again."""
+        return self._clock() >= self._ends_s
+
+
+class Hearing:
+    """The launcher's end: what it knows of one keeper."""
+
+    def __init__(self, lease_s: float) -> None:
+        self._lease_s = lease_s
+        self.seen = 0
+        """Number of the newest answer."""
+        self.heard_s: float | None = None
+        """When it came; None before the first."""
+
+    def take(self, now_s: float, number: int | None = None) -> None:
+        """Notes an answer: `number` if it is one to a look, None to another call, which prolongs no lease."""
+        self.heard_s = now_s
+        if number is not None:
+            self.seen = number
+
+    def is_over(self, now_s: float) -> bool:
+        """Whether the keeper's lease has ended for certain."""
+        return self.heard_s is not None and now_s >= self.heard_s + self._lease_s + MARGIN_S

@@ -1,0 +1,172 @@
+"""What keeps a role on another host: its folder, its process, its lease."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import apex_bat
+from apex_bat.launching import keeper as module
+from apex_bat.launching.keeper import MARK, Keeper, free_port, versions_here
+from apex_bat.launching.supervisor import Exit
+from apex_bat.roles.plan import Role
+
+ACTOR = Role("actor", 2)
+
+
+class Process:
+    """Stands for a role's process; keeps what it is told."""
+
+    made: list[Process]
+
+    def __init__(
+        self, role: Role, run: Path, incarnation: int, num_threads: int, flown_steps: int, **more: Any
+    ) -> None:
+        self.given = (role, run, incarnation, num_threads, flown_steps)
+        self.told, self.folder = [more["orders"]], more["folder"]
+        self.ended: Exit | None = None
+        self.is_killed = threading.Event()
+        self.pid = 100 + len(self.made)
+        self.made.append(self)
+
+    def poll(self) -> Exit | None:
+        return self.ended
+
+    def tell(self, orders: bytes) -> None:
+        self.told.append(orders)
+
+    def stop(self) -> None:
+        self.ended = Exit(0, "")
+
+    def kill(self) -> None:
+        self.ended = self.ended or Exit(-9, "")
+        self.is_killed.set()
+
+
+class Clock:
+    """Shows what the test says."""
+
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+Make = Callable[..., Keeper]
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def make(tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+    monkeypatch.setattr(module, "RoleProcess", Process)
+    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
+    Process.made = []
+    made: list[Keeper] = []
+
+    def one(mark: str = "m", folder: str = "/nowhere") -> Keeper:
+        made.append(Keeper(str(tmp_path), mark, folder, 10.0, "127.0.0.1", clock=clock))
+        return made[-1]
+
+    (tmp_path / MARK).write_text("m")
+    yield one
+    for each in made:
+        each.close()
+
+
+def start(keeper: Keeper, life: int = 1) -> int:
+    return keeper.start(life, ACTOR, 7, 1, 500, b"first\n")
+
+
+def test_a_role_is_started_told_and_looked_at(make: Make, tmp_path: Path) -> None:
+    keeper = make(folder=str(tmp_path))
+    assert start(keeper) == 100
+    (process,) = Process.made
+    assert process.given == (ACTOR, tmp_path, 7, 1, 500)
+    assert process.folder == tmp_path
+    look = keeper.look(0, b"news\n")
+    assert process.told == [b"first\n", b"news\n"]
+    assert (look.life, look.pid, look.has_ended) == (1, 100, False)
+    process.ended = Exit(3, "it broke")
+    look = keeper.look(look.number)
+    assert (look.has_ended, look.code, look.detail) == (True, 3, "it broke")
+
+
+def test_a_second_start_ends_the_first_process(make: Make) -> None:
+    keeper = make()
+    start(keeper)
+    assert start(keeper, life=2) == 101
+    assert Process.made[0].is_killed.is_set()
+    assert keeper.look(0).life == 2
+
+
+def test_the_role_is_killed_when_the_lease_lapses_and_nothing_is_started_then(make: Make, clock: Clock) -> None:
+    keeper = make()
+    start(keeper)
+    clock.now_s = 9.0
+    assert not Process.made[0].is_killed.wait(3 * module.LOOK_S)
+    clock.now_s = 10.0
+    assert Process.made[0].is_killed.wait(10.0)
+    assert start(keeper, life=2) == 0, "an order that was long under way"
+    assert len(Process.made) == 1
+    look = keeper.look(0)
+    assert (look.code, look.detail) == (-9, "its host had not heard the launcher for the lease")
+    keeper.look(look.number)
+    assert start(keeper, life=3) == 101, "the launcher is heard again"
+
+
+def test_looks_keep_the_role_alive(make: Make, clock: Clock) -> None:
+    keeper = make()
+    start(keeper)
+    seen = 0
+    for _ in range(20):
+        clock.now_s += 4.0
+        seen = keeper.look(seen).number
+    assert not Process.made[0].is_killed.wait(3 * module.LOOK_S)
+
+
+def test_a_folder_that_is_not_the_launchers_is_refused(make: Make, tmp_path: Path) -> None:
+    assert make().site(versions_here()).problem == ""
+    assert "another folder" in make(mark="other").site(versions_here()).problem
+    (tmp_path / MARK).unlink()
+    problem = make().site(versions_here()).problem
+    assert "No such file" in problem
+    assert "give --run a folder that all nodes share" in problem
+
+
+def test_other_versions_are_refused(make: Make) -> None:
+    assert "versions differ" in make().site(("0.0.0", "3.11")).problem
+
+
+def test_a_port_is_one_of_those_allowed_and_free() -> None:
+    port = free_port("127.0.0.1")
+    assert port > 0
+    assert free_port("127.0.0.1", port) in range(port, port + 100)
+
+
+def test_a_role_finds_this_package_wherever_it_came_from(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", "/other")
+    monkeypatch.setattr(apex_bat, "__file__", str(tmp_path / "apex_bat" / "__init__.py"))
+    monkeypatch.syspath_prepend(tmp_path)
+    start(make())
+    assert os.environ["PYTHONPATH"] == f"{tmp_path}{os.pathsep}/other"
+
+
+def test_closing_ends_the_role(make: Make) -> None:
+    keeper = make()
+    start(keeper)
+    begun_s = time.monotonic()
+    keeper.close()
+    assert Process.made[0].is_killed.is_set()
+    assert time.monotonic() - begun_s < 5.0

@@ -1,0 +1,138 @@
+"""What the launcher says and asks of Ray, without a cluster; `tests/cluster` has one."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import pytest
+
+pytest.importorskip("ray")
+
+from apex_bat.cli.training import check
+from apex_bat.config import Config, ConfigError, load
+from apex_bat.config.settings import MOST_ACTORS
+from apex_bat.launching import ray_cluster as module
+from apex_bat.launching.placement import ClusterError, Resources
+from apex_bat.launching.ray_cluster import connected, num_actor_places
+
+
+@dataclass
+class Ray:
+    """What Ray says of a cluster."""
+
+    nodes: list[Resources]
+    free: Resources
+
+
+@pytest.fixture
+def ray(monkeypatch: pytest.MonkeyPatch) -> Ray:
+    one = Ray([{"CPU": 4.0, "memory": 1e10}, {"CPU": 3.0, "memory": 1e10}], {"CPU": 2.0})
+    monkeypatch.setattr(module, "_all_nodes", lambda: [{"Alive": True, "Resources": node} for node in one.nodes])
+    monkeypatch.setattr(module, "_free", lambda: one.free)
+    return one
+
+
+@dataclass
+class FakeFleet:
+    """Says whether a role waits for a place."""
+
+    is_waiting: bool = False
+
+
+def growth(*settings: str, fleet: FakeFleet | None = None) -> Any:
+    return module._Growth(load(None, ["actors=3", *settings]), fleet or FakeFleet())  # type: ignore[arg-type]
+
+
+def test_actors_are_added_while_there_is_room_and_the_settings_say_so(ray: Ray) -> None:
+    grown = growth("cluster.grow=true")
+    assert [role.name for role in grown.more()] == ["actor-3", "actor-4"]
+    ray.free = {"CPU": 1.5}
+    assert [role.name for role in grown.more()] == ["actor-5"]
+    ray.free = {"CPU": 0.5}
+    assert grown.more() == []
+    assert growth("cluster.grow=false").more() == []
+
+
+def test_no_actor_is_added_while_one_waits_for_a_place(ray: Ray) -> None:
+    del ray
+    assert growth("cluster.grow=true", fleet=FakeFleet(is_waiting=True)).more() == []
+
+
+def test_a_huge_cluster_is_filled_in_steps_and_not_beyond_the_most(ray: Ray) -> None:
+    ray.free = {"CPU": 1e6}
+    grown, number = growth("cluster.grow=true"), 3
+    while more := grown.more():
+        assert len(more) <= module._MOST_AT_ONCE
+        number += len(more)
+    assert number == MOST_ACTORS
+
+
+def test_auto_counts_places_beside_the_other_roles(ray: Ray) -> None:
+    assert num_actor_places(Config()) == 4, "7 CPU, and 3 for replay, learner and evaluator"
+    assert num_actor_places(load(None, ["cluster.role_cpus=0.5"])) == 10
+    ray.nodes = [{"CPU": 1.0}]
+    assert num_actor_places(Config()) == 1
+
+
+def test_the_learner_gets_a_gpu_of_a_cluster_that_has_one(ray: Ray) -> None:
+    assert not module._has_gpu(module._nodes())
+    ray.nodes.append({"CPU": 1.0, "GPU": 1.0})
+    assert module._has_gpu(module._nodes())
+
+
+class NoPlace:
+    """A placement group that is never ready."""
+
+    def wait(self, timeout_s: float) -> bool:
+        del timeout_s
+        return False
+
+
+def test_waiting_for_a_place_is_said_and_ends_after_the_time_that_is_set(
+    ray: Ray, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    del ray
+    monkeypatch.setattr(module, "_QUIET_S", 0.0)
+    demands = {"learner": {"CPU": 16.0}}
+    for wait_s in (0.01, 0.02):
+        config = load(None, [f"cluster.wait_s={wait_s}"])
+        with caplog.at_level(logging.WARNING), pytest.raises(ClusterError, match=f"within {wait_s:g} s") as failed:
+            module._await_places(NoPlace(), demands, config)  # type: ignore[arg-type]
+        assert "asked: learner: 16 CPU. There is: 4 CPU" in str(failed.value)
+        assert "Free of it: 2 CPU" in str(failed.value)
+    assert "waits for a place in the cluster" in caplog.text
+
+
+def test_a_launcher_outside_the_cluster_is_refused() -> None:
+    with pytest.raises(ClusterError, match="must run on a node of the cluster"), connected("ray://10.0.0.1:10001"):
+        pass
+
+
+def test_an_address_to_listen_at_is_refused_because_each_node_has_its_own() -> None:
+    config = load(None, ["transport.host=127.0.0.1"])
+    check(config)
+    with pytest.raises(ConfigError, match=r"transport\.host: on a cluster"):
+        check(config, on_cluster=True)
+
+
+def test_every_setting_of_the_cluster_is_tested_somewhere() -> None:
+    tested = {
+        "role_cpus", "learner_gpus", "replay_memory_gb", "learner_resource", "replay_resource", "actor_resource",
+        "grow", "wait_s", "lease_s",
+    }  # fmt: skip
+    assert {field.name for field in msgspec.structs.fields(type(Config().cluster))} == tested
+
+
+def test_what_ray_prints_of_dying_nodes_is_one_line_in_the_log(
+    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with caplog.at_level(logging.INFO):
+        module._note({"lines": ["\na node died\n" + "state dump\n" * 200], "pid": "raylet"}, ignore_prefix=False)
+    assert [record.getMessage() for record in caplog.records] == ["Ray: a node died"]
+    assert capsys.readouterr().out == ""
+    from ray._private import worker
+
+    assert hasattr(worker, "print_to_stdstream"), "what is replaced is still there in this Ray"

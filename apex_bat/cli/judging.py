@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from apex_bat.cli.training import Overrides
+from apex_bat.cli.options import Overrides
 
 Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file, for programs.")]
 RunFolder = Annotated[Path, typer.Argument(help="Run folder.")]
@@ -35,7 +35,7 @@ def evaluate(
     With --set it flies under other settings than it was trained with, for example --set sonar.rendering=exact; the
     result says which. With --policy and without a run a baseline flies.
     """
-    from apex_bat.cli.training import print_result
+    from apex_bat.cli.concluding import print_result
     from apex_bat.config import load
     from apex_bat.evaluation import runs
     from apex_bat.recording.keeping import keep_flights, num_logged

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from apex_bat.cli.training import ConfigFile, Overrides, check, follow, locked_run
+from apex_bat.cli.checking import check
+from apex_bat.cli.following import follow, locked_run
+from apex_bat.cli.options import ConfigFile, Overrides
 from apex_bat.config import Config, ConfigError, load
 
 if TYPE_CHECKING:  # `--help` needs none of it

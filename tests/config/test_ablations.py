@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from apex_bat.cli.training import check
+from apex_bat.cli.checking import check
 from apex_bat.config import Config, load
 from apex_bat.config.loading import differences
 

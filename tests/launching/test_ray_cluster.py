@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("ray")
 
-from apex_bat.cli.training import check
+from apex_bat.cli.checking import check
 from apex_bat.config import Config, ConfigError, load
 from apex_bat.config.settings import MOST_ACTORS
 from apex_bat.launching import ray_cluster as module

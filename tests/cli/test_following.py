@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from apex_bat.cli import training
+from apex_bat.cli import following
 from apex_bat.config import Config
 from apex_bat.evaluation import runs
 from apex_bat.evaluation.runs import RunError
@@ -80,9 +80,9 @@ def test_unfinished_files_go_when_a_run_begins_and_when_it_ends(is_cut: bool, tm
     console = Console(file=io.StringIO())
     if is_cut:
         with pytest.raises(KeyboardInterrupt):
-            training.follow(start, tmp_path, "", console, plain=True)
+            following.follow(start, tmp_path, "", console, plain=True)
     else:
-        training.follow(start, tmp_path, "", console, plain=True)
+        following.follow(start, tmp_path, "", console, plain=True)
     assert not left.exists()
 
 

@@ -106,7 +106,7 @@ def _create(
     if cluster is None:
         config = load(config_file, overrides)
     else:
-        from apex_bat.launching import ray_cluster
+        from apex_bat.launching.cluster import ray_cluster
 
         with ray_cluster.connected(cluster):  # before a folder is made that nothing would run in
             config = load(config_file, overrides, ray_cluster.num_actor_places)
@@ -148,7 +148,7 @@ def _starter(
         from apex_bat.launching.standing import NEW_RUN
 
         if cluster is not None:
-            from apex_bat.launching import ray_cluster
+            from apex_bat.launching.cluster import ray_cluster
 
             with ray_cluster.connected(cluster):
                 return ray_cluster.train(config, folder, view, origin=origin or NEW_RUN, part=part)

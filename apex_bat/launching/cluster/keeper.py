@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import apex_bat
-from apex_bat.launching.lease import Lease
+from apex_bat.launching.cluster.lease import Lease
 from apex_bat.launching.processes import RoleProcess
 from apex_bat.roles.plan import Role
 

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 import apex_bat
-from apex_bat.launching import keeper as module
-from apex_bat.launching.keeper import MARK, Keeper, free_port, versions_here
+from apex_bat.launching.cluster import keeper as module
+from apex_bat.launching.cluster.keeper import MARK, Keeper, free_port, versions_here
 from apex_bat.launching.supervisor import Exit
 from apex_bat.roles.plan import Role
 

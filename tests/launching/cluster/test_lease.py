@@ -2,7 +2,7 @@
 
 import random
 
-from apex_bat.launching.lease import MARGIN_S, Hearing, Lease
+from apex_bat.launching.cluster.lease import MARGIN_S, Hearing, Lease
 
 
 class Clock:

@@ -10,11 +10,11 @@ import msgspec
 import pytest
 
 from apex_bat.config import Config, load
-from apex_bat.launching import fleet as module
-from apex_bat.launching.fleet import Fleet, LostError
-from apex_bat.launching.keeper import Look, Site
-from apex_bat.launching.lease import MARGIN_S, Hearing
-from apex_bat.launching.placed import Placed
+from apex_bat.launching.cluster import fleet as module
+from apex_bat.launching.cluster.fleet import Fleet, LostError
+from apex_bat.launching.cluster.keeper import Look, Site
+from apex_bat.launching.cluster.lease import MARGIN_S, Hearing
+from apex_bat.launching.cluster.placed import Placed
 from apex_bat.launching.supervisor import USELESS
 from apex_bat.roles.orders import Orders
 from apex_bat.roles.plan import Role

@@ -1,4 +1,4 @@
-"""What the launcher says and asks of Ray, without a cluster; `tests/cluster` has one."""
+"""What the launcher says and asks of Ray, without a cluster; `test_runs_on_ray` has one."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ pytest.importorskip("ray")
 from apex_bat.cli.checking import check
 from apex_bat.config import Config, ConfigError, load
 from apex_bat.config.settings import MOST_ACTORS
-from apex_bat.launching import ray_cluster as module
-from apex_bat.launching.placement import ClusterError, Resources
-from apex_bat.launching.ray_cluster import connected, num_actor_places
+from apex_bat.launching.cluster import ray_cluster as module
+from apex_bat.launching.cluster.placement import ClusterError, Resources
+from apex_bat.launching.cluster.ray_cluster import connected, num_actor_places
 
 
 @dataclass

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from apex_bat.config import Config, load
-from apex_bat.launching.placement import (
+from apex_bat.launching.cluster.placement import (
     Resources,
     as_text,
     core_roles,

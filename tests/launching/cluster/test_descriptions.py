@@ -16,7 +16,7 @@ import pytest
 
 from apex_bat.config import load
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 LAUNCH = ROOT / "launch"
 SCRIPTS = ("slurm.sbatch", "hosts.sh")
 DESCRIPTIONS = (*SCRIPTS, "ray-cluster.yaml", "rayjob.yaml")

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import Literal
 
 from apex_bat.config import Config
-from apex_bat.launching.keeper import Look, Site
-from apex_bat.launching.lease import MARGIN_S, Hearing
+from apex_bat.launching.cluster.keeper import Look, Site
+from apex_bat.launching.cluster.lease import MARGIN_S, Hearing
 from apex_bat.launching.supervisor import USELESS, Exit
 from apex_bat.roles.plan import Role
 

@@ -28,12 +28,9 @@ from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from apex_bat.config import Config
 from apex_bat.config.settings import MOST_ACTORS
-from apex_bat.launching.course import Course, Ended
-from apex_bat.launching.fleet import Fleet, LostError, Remote
-from apex_bat.launching.keeper import MARK, Keeper, Look, Site, free_port
-from apex_bat.launching.live import View
-from apex_bat.launching.local import terminable
-from apex_bat.launching.placement import (
+from apex_bat.launching.cluster.fleet import Fleet, LostError, Remote
+from apex_bat.launching.cluster.keeper import MARK, Keeper, Look, Site, free_port
+from apex_bat.launching.cluster.placement import (
     ClusterError,
     Resources,
     as_text,
@@ -43,6 +40,9 @@ from apex_bat.launching.placement import (
     num_places_beside,
     shortage,
 )
+from apex_bat.launching.course import Course, Ended
+from apex_bat.launching.live import View
+from apex_bat.launching.local import terminable
 from apex_bat.launching.standing import NEW_RUN, Origin
 from apex_bat.roles.logs import launcher_log
 from apex_bat.roles.plan import Role, roles_of

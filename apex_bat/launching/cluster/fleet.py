@@ -14,11 +14,11 @@ from types import TracebackType
 from typing import Protocol
 
 from apex_bat.config import Config
-from apex_bat.launching.directory import Directory, new_generation
-from apex_bat.launching.keeper import Look, Site, versions_here
-from apex_bat.launching.lease import Hearing
-from apex_bat.launching.placed import Order, Placed
-from apex_bat.launching.placement import ClusterError
+from apex_bat.launching.cluster.directory import Directory, new_generation
+from apex_bat.launching.cluster.keeper import Look, Site, versions_here
+from apex_bat.launching.cluster.lease import Hearing
+from apex_bat.launching.cluster.placed import Order, Placed
+from apex_bat.launching.cluster.placement import ClusterError
 from apex_bat.launching.processes import threads_of
 from apex_bat.roles.orders import line_of
 from apex_bat.roles.plan import Role

@@ -8,7 +8,7 @@ from apex_bat.config import Config
 from apex_bat.config.loading import dumps
 from benchmarks.cluster_faults import BEGIN, END, TARGET_S, table
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PAGE = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
 RESULT = json.loads((ROOT / "docs" / "results" / "cluster.json").read_text(encoding="utf-8"))
 

@@ -1,6 +1,6 @@
 """Endpoints that move: who is told what, and that each life has another generation."""
 
-from apex_bat.launching.directory import Directory
+from apex_bat.launching.cluster.directory import Directory
 from apex_bat.roles.plan import Role
 
 LEARNER, ACTOR, EVALUATOR = Role("learner", 0), Role("actor", 3), Role("evaluator", 0)

@@ -17,6 +17,7 @@ from apex_bat.storage import StorageError, read_arrays, write_arrays
 
 KIND = "apex_bat checkpoint 1"
 BEST = "best.npz"
+CHANCE = 0.1  # share by which the progress of equally good policies differs
 _NAME = re.compile(r"step-(\d{9})\.npz")
 _log = logging.getLogger(__name__)
 
@@ -114,18 +115,29 @@ def step_of(path: Path) -> int:
     return int(match[1])
 
 
-def mark_best(folder: Path, checkpoint: Checkpoint, score: tuple[float, ...]) -> bool:
-    """Keeps a checkpoint as the best if its score is at least that of the best so far; says whether.
+def mark_best(folder: Path, checkpoint: Checkpoint, score: tuple[float, float]) -> bool:
+    """Keeps a checkpoint as the best unless the best so far is better; says whether.
+
+    More completed flights are better. Where as many were completed, more progress is, if it is more by a tenth: less is
+    chance, and then the newer one, which has learnt more, is kept.
 
     Score and checkpoint are one file, so that no kill can part them; and it is written from memory, so that it does not
     matter whether the numbered file was removed while it was judged.
+
+    Args:
+        folder: of the checkpoints.
+        checkpoint: the one that was judged, newer than all before.
+        score: share of completed flights, and mean progress in m.
 
     Raises:
         StorageError: it could not be written; the best so far is untouched.
     """
     path = folder / BEST
-    if path.exists() and _score_of(path) > score:
-        return False
+    so_far = _score_of(path) if path.exists() else None
+    if so_far is not None:
+        completed, progress_m = so_far
+        if score[0] < completed or (score[0] == completed and score[1] < (1.0 - CHANCE) * progress_m):
+            return False
     _write(path, checkpoint._replace(counters=checkpoint.counters | {"score": list(score)}))
     return True
 
@@ -146,10 +158,10 @@ def _write(path: Path, checkpoint: Checkpoint) -> None:
     write_arrays(path, KIND, header, checkpoint.arrays)
 
 
-def _score_of(path: Path) -> tuple[float, ...]:
-    """Returns the score of the best checkpoint so far; the least of all if it is damaged."""
+def _score_of(path: Path) -> tuple[float, float] | None:
+    """Returns the score of the best checkpoint so far; None if it is damaged."""
     try:
-        return tuple(msgspec.convert(load(path).counters.get("score"), list[float]))
+        return msgspec.convert(load(path).counters.get("score"), tuple[float, float])
     except (StorageError, msgspec.ValidationError) as error:
         _log.warning("%s: not read, the next checkpoint counts as the best: %s", path, error)
-        return ()
+        return None

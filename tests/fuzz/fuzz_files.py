@@ -136,7 +136,7 @@ def _arena(content: bytes) -> object:
 
 def _best(content: bytes) -> object:
     _file(content, f"checkpoints/{checkpoint.BEST}")
-    return checkpoint.mark_best(_folder() / "checkpoints", checkpoint.Checkpoint(1, {}, {}, {}), (0.25,))
+    return checkpoint.mark_best(_folder() / "checkpoints", checkpoint.Checkpoint(1, {}, {}, {}), (0.25, 1.0))
 
 
 def _keys(content: bytes) -> object:

@@ -43,6 +43,15 @@ def test_best_is_replaced_by_what_is_as_good_and_newer_only(tmp_path: Path) -> N
     assert checkpoint.load(tmp_path / checkpoint.BEST).learner_step == 3
 
 
+def test_of_equally_many_completed_flights_the_newer_is_best_unless_it_comes_less_far_by_a_tenth(
+    tmp_path: Path,
+) -> None:
+    checkpoint.mark_best(tmp_path, made(1), (1.0, 160.0))
+    assert not checkpoint.mark_best(tmp_path, made(2), (1.0, 140.0)), "it spins"
+    assert checkpoint.mark_best(tmp_path, made(3), (1.0, 150.0))
+    assert checkpoint.load(tmp_path / checkpoint.BEST).counters["score"] == [1.0, 150.0]
+
+
 def test_a_torn_newest_checkpoint_gives_way_to_the_one_before(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     save(tmp_path, 1)
     torn = save(tmp_path, 2)

@@ -8,6 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+REPORT = (ROOT / "docs" / "results" / "reproduction" / "report.md").read_text(encoding="utf-8")
 RESULT: dict[str, Any] = json.loads((ROOT / "docs" / "results" / "memory_simple.json").read_text(encoding="utf-8"))
 
 
@@ -20,10 +21,25 @@ def test_each_row_of_the_table_is_that_of_the_result(row: dict[str, Any]) -> Non
     assert line in README
 
 
-def test_the_bat_of_the_readme_completes_fourteen_of_fifteen_in_simple() -> None:
-    simple = next(row for row in RESULT["summary"] if row["arena"] == "simple")
-    assert simple["flights"] == 15
-    assert simple["completed"] >= 14
+def test_the_bat_of_the_readme_completes_all_flights_in_the_arenas_of_the_thesis() -> None:
+    completed = {row["arena"]: (row["completed"], row["flights"]) for row in RESULT["summary"]}
+    assert completed == {"simple": (15, 15), "narrow": (15, 15), "circle": (15, 15)}
+
+
+@pytest.mark.parametrize("pilot", ["memory", "no_memory", "onset", "random", "ild", "oracle"])
+def test_each_row_of_the_thesis_repeated_is_that_of_the_report(pilot: str) -> None:
+    def cells(text: str) -> list[str]:
+        row = next(line for line in text.splitlines() if line.startswith(f"| {pilot} | "))
+        return row.strip("| ").split(" | ")
+
+    seeds, completed, distance_m, progress_m = (cells(REPORT)[column] for column in (1, 2, 4, 6))
+    assert cells(README)[1:5] == [seeds, completed, distance_m, progress_m]
+
+
+def test_how_many_numbers_of_the_thesis_are_reproduced_is_what_the_report_says() -> None:
+    sentence = REPORT.partition("**")[2].partition(". ")[0]
+    assert sentence.startswith("Of 17 numbers of the thesis")
+    assert sentence in " ".join(README.split())
 
 
 def test_what_other_starts_gave_is_said() -> None:

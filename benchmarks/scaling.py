@@ -52,12 +52,16 @@ class Scale(NamedTuple):
     """Of the learner, in learners of this machine's core."""
     ratio: float | None
     """Samples per insert; None: nobody waits for anybody."""
+    batch_size: int = 64
 
     @property
     def name(self) -> str:
         """Of its records."""
         law = "free" if self.ratio is None else f"ratio_{self.ratio:g}"
-        return f"scaling.at.cores_{self.cores}.servers_{self.servers}.learner_x{self.speed:g}.{law}"
+        return (
+            f"scaling.at.cores_{self.cores}.servers_{self.servers}.learner_x{self.speed:g}.{law}"
+            f".batch_{self.batch_size}"
+        )
 
     @property
     def actors(self) -> int:
@@ -67,7 +71,8 @@ class Scale(NamedTuple):
 
 SCALES = (
     Scale(10, 1, 1.0, 8.0), Scale(10, 1, 20.0, 8.0), Scale(10, 1, 1.0, None),
-    Scale(100, 1, 20.0, 8.0), Scale(100, 1, 20.0, 0.5), Scale(100, 1, 1.0, None), Scale(100, 2, 1.0, None),
+    Scale(100, 1, 20.0, 8.0), Scale(100, 4, 20.0, 8.0), Scale(100, 1, 20.0, 8.0, 512), Scale(100, 4, 20.0, 8.0, 512),
+    Scale(100, 1, 20.0, 0.5), Scale(100, 1, 1.0, None), Scale(100, 2, 1.0, None),
     Scale(1000, 1, 20.0, 0.5), Scale(1000, 1, 1.0, None), Scale(1000, 8, 1.0, None), Scale(1000, 16, 1.0, None),
 )  # fmt: skip
 
@@ -89,13 +94,14 @@ def predictions(costs: Costs) -> list[Record]:
     records: list[Record] = []
     for scale in SCALES:
         duration_s = SIMULATED_S * min(1.0, 100.0 / scale.actors)
-        records += outcome_records(scale.name, Simulation(_run_at(scale), at_speed(costs, scale)).outcome(duration_s))
+        faster = at_speed(costs, scale.speed)
+        records += outcome_records(scale.name, Simulation(_run_at(scale), faster).outcome(duration_s))
     return records
 
 
-def at_speed(costs: Costs, scale: Scale) -> Costs:
-    """Returns the costs with the learner of a scale."""
-    return costs._replace(update_s=costs.update_s / scale.speed)
+def at_speed(costs: Costs, speed: float) -> Costs:
+    """Returns the costs with a learner whose device is so many times as fast; its host is as fast as before."""
+    return costs._replace(update_s=costs.update_s / speed, update_item_s=costs.update_item_s / speed)
 
 
 def predict(config: Config, costs: Costs, cores: int | None, duration_s: float = SIMULATED_S) -> Outcome:
@@ -152,11 +158,13 @@ def _rate(rows: list[dict[str, Any]], name: str) -> float:
 
 def _run_at(scale: Scale) -> Run:
     config = Config()
+    learner = msgspec.structs.replace(config.learner, batch_size=scale.batch_size)
+    config = msgspec.structs.replace(config, learner=learner)
     ratio, band = scale.ratio or 8.0, float("inf")
     if scale.ratio is not None:
         replay = msgspec.structs.replace(config.replay, samples_per_insert=ratio, shards=scale.servers)
         band = limiter_of(msgspec.structs.replace(config, replay=replay)).error_buffer * scale.servers
-    return Run(scale.actors, samples_per_insert=ratio, band=band, servers=scale.servers)
+    return Run(scale.actors, scale.batch_size, samples_per_insert=ratio, band=band, servers=scale.servers)
 
 
 def table(records: Sequence[Record]) -> str:

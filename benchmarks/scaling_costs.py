@@ -36,7 +36,7 @@ ACTOR_STEPS = 150  # of 16 bats, a round
 INSERTS = 1500  # of one chunk, a round
 BATCHES = 200  # a round
 FILL = 200  # chunks in the server before batches are drawn
-UPDATES = 40  # a round
+UPDATES = 40  # a round, with batches of the first size; fewer with larger ones
 CHUNK = 50
 SIZES = (64, 512)  # of batches: two, so that what grows with the size is told from what does not
 
@@ -58,11 +58,13 @@ def costs_of(records: Sequence[Record]) -> Costs:
     """Returns the model's costs from the records of `measure_costs`."""
     us = {str(r["name"]).removeprefix("scaling.cost."): float(r["median"]) * 1e-6 for r in records}
     small, large = SIZES
-    item_s = (us[f"batch_{large}_us"] - us[f"batch_{small}_us"]) / (large - small)
-    return Costs(
-        us["step_us"] + us["send_us"] / CHUNK, us["insert_us"], us[f"batch_{small}_us"] - small * item_s, item_s,
-        us["update_us"] + us[f"take_{small}_us"],
-    )  # fmt: skip
+
+    def line(part: str) -> tuple[float, float]:
+        """Returns what does not grow with the size of a batch, and what each transition of it costs."""
+        item_s = (us[f"{part}_{large}_us"] - us[f"{part}_{small}_us"]) / (large - small)
+        return us[f"{part}_{small}_us"] - small * item_s, item_s
+
+    return Costs(us["step_us"] + us["send_us"] / CHUNK, us["insert_us"], *line("batch"), *line("update"), *line("take"))
 
 
 def _costs() -> list[Record]:
@@ -73,7 +75,7 @@ def _costs() -> list[Record]:
         batches, takes = _batch_us(size)
         records.append(summary(f"scaling.cost.batch_{size}_us", "us", batches))
         records.append(summary(f"scaling.cost.take_{size}_us", "us", takes))
-    records.append(summary("scaling.cost.update_us", "us", _update_us()))
+        records.append(summary(f"scaling.cost.update_{size}_us", "us", _update_us(size)))
     transition_mb, batch_mb = message_mb(SIZES[0])
     records.append(summary("scaling.wire.transition_bytes", "B", [transition_mb * 1e6]))
     records.append(summary("scaling.wire.batch_64_bytes", "B", [batch_mb * 1e6]))
@@ -188,18 +190,19 @@ def _batch_us(size: int) -> tuple[list[float], list[float]]:
     return served, taken
 
 
-def _update_us() -> list[float]:
-    """Returns CPU of the learner for an update of the default batch."""
+def _update_us(size: int) -> list[float]:
+    """Returns CPU of the learner for an update."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     agent = D3QN(Config(), device_of("cpu"))
-    batches = batches_in_memory(SIZES[0], 8)
+    batches = batches_in_memory(size, 8)
+    updates = UPDATES * SIZES[0] // size
     values = []
     for _ in range(ROUNDS + 1):
         begun_s = time.process_time()
-        for number in range(UPDATES):
+        for number in range(updates):
             agent.update(batches[number % len(batches)])
-        values.append((time.process_time() - begun_s) / UPDATES * 1e6)
+        values.append((time.process_time() - begun_s) / updates * 1e6)
     return values[1:]
 
 

@@ -32,7 +32,17 @@ class Costs(NamedTuple):
     item_s: float
     """The same for each transition of it."""
     update_s: float
-    """Of the learner for an update, the batch taken and priorities sent included."""
+    """Of the learner for an update, by its device: what does not grow with the batch."""
+    update_item_s: float = 0.0
+    """The same for each transition of the batch."""
+    take_s: float = 0.0
+    """Of the learner's host to take a batch and send its priorities, one after the other with the update."""
+    take_item_s: float = 0.0
+    """The same for each transition of the batch."""
+
+    def learn_s(self, batch_size: int) -> float:
+        """Returns the time of the learner for an update, taking the batch and sending its priorities included."""
+        return self.update_s + self.take_s + batch_size * (self.update_item_s + self.take_item_s)
 
 
 class Run(NamedTuple):
@@ -271,8 +281,9 @@ class Simulation:
         if self._is_learning or not self._ready:
             return
         self._is_learning, self._ready = True, self._ready - 1
-        self._learned_s += self._costs.update_s
-        self._learner_cores.give(self._now_s, self._costs.update_s, self._learned)
+        work_s = self._costs.learn_s(self._run.batch_size)
+        self._learned_s += work_s
+        self._learner_cores.give(self._now_s, work_s, self._learned)
 
     def _learned(self) -> None:
         self._is_learning = False

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from benchmarks.performance import RESULTS
 from benchmarks.replay import Record
-from benchmarks.scaling import SCALES, SETUPS, Scale
+from benchmarks.scaling import SCALES, SETUPS, Scale, at_speed
 from benchmarks.scaling_costs import CHUNK, costs_of
 from benchmarks.scaling_model import Outcome
 
@@ -36,7 +36,18 @@ def _costs(records: Sequence[Record]) -> list[str]:
         (f"a server, for an insert of {CHUNK} transitions", costs.insert_s * 1e6, "us"),
         (f"a server, for a batch of {BATCH} and its new priorities", median["scaling.cost.batch_64_us"], "us"),
         ("a server, for a batch of 512 and its new priorities", median["scaling.cost.batch_512_us"], "us"),
-        (f"the learner, for an update with {BATCH}", costs.update_s * 1e6, "us"),
+        (f"the learner, for an update with {BATCH}", median["scaling.cost.update_64_us"], "us"),
+        ("the learner, for an update with 512", median["scaling.cost.update_512_us"], "us"),
+        (
+            f"the learner's host, to take a batch of {BATCH} and send its priorities",
+            median["scaling.cost.take_64_us"],
+            "us",
+        ),
+        (
+            "the learner's host, to take a batch of 512 and send its priorities",
+            median["scaling.cost.take_512_us"],
+            "us",
+        ),
         ("a transition on the wire", median["scaling.wire.transition_bytes"], "B"),
         (f"a batch of {BATCH} on the wire", median["scaling.wire.batch_64_bytes"], "B"),
         ("the weights on the wire, to each actor", median["scaling.wire.weights_bytes"], "B"),
@@ -47,9 +58,9 @@ def _costs(records: Sequence[Record]) -> list[str]:
 def _limits(records: Sequence[Record], median: dict[str, float]) -> list[str]:
     costs = costs_of(records)
     actor, server = 1.0 / costs.step_s, CHUNK / costs.insert_s
-    updates = 1.0 / costs.update_s
+    updates, fast = 1.0 / costs.learn_s(BATCH), 1.0 / at_speed(costs, 20.0).learn_s(BATCH)
     part_s = costs.request_s + BATCH * costs.item_s
-    weights_mb = median["scaling.wire.weights_bytes"] / 1e6 * updates / PERIOD
+    weights_mb = median["scaling.wire.weights_bytes"] / 1e6 / PERIOD
     return [
         "Each by itself, on a core of its own:",
         "",
@@ -59,8 +70,8 @@ def _limits(records: Sequence[Record], median: dict[str, float]) -> list[str]:
         f"- The learner makes {_number(updates)} updates/s. At {RATIO:g} samples per insert that uses up "
         f"{_number(updates * BATCH / RATIO)} transitions/s: the work of {_number(updates * BATCH / RATIO / actor)} "
         f"actors. It is the first bottleneck: more actors than that wait for it, by the law of samples per insert.",
-        f"- Weights go to every actor each {PERIOD} updates: {_number(weights_mb)} MB/s an actor beside a learner of "
-        f"one core. With a learner 20 times as fast 100 actors draw {_number(weights_mb * 20 * 100)} MB/s from it: "
+        f"- Weights go to every actor each {PERIOD} updates: {_number(weights_mb * updates)} MB/s an actor beside a "
+        f"learner of one core. From one 20 times as fast 100 actors draw {_number(weights_mb * fast * 100)} MB/s: "
         f"then `learner.weights_period` is to grow with its speed, or the network is the bottleneck.",
     ]
 
@@ -82,9 +93,9 @@ def _beside(median: dict[str, float]) -> list[str]:
 
 
 def _scales(records: Sequence[Record], median: dict[str, float]) -> list[str]:
-    lines = ["| cores | servers | learner | samples per insert | steps/s | updates/s | measured ratio | servers busy | "
-             "actors held | core-hours a million steps | binds |",
-             "|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|---|"]  # fmt: skip
+    lines = ["| cores | servers | learner | batch | samples per insert | steps/s | updates/s | measured ratio | "
+             "servers busy | actors held | core-hours a million steps | binds |",
+             "|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|---|"]  # fmt: skip
     del records
     for scale in SCALES:
         if f"{scale.name}.steps_per_s" not in median:
@@ -92,7 +103,8 @@ def _scales(records: Sequence[Record], median: dict[str, float]) -> list[str]:
         steps, updates, ratio, server, learner, held = (median[f"{scale.name}.{figure}"] for figure in Outcome._fields)
         law = "free" if scale.ratio is None else f"{scale.ratio:g}"
         lines.append(
-            f"| {scale.cores:,} | {scale.servers} | x{scale.speed:g} | {law} | {_number(steps)} | {_number(updates)} | "
+            f"| {scale.cores:,} | {scale.servers} | x{scale.speed:g} | {scale.batch_size} | {law} | "
+            f"{_number(steps)} | {_number(updates)} | "
             f"{_number(ratio)} | {server:.0%} | {held:.0%} | {_number(scale.cores / 3600 * 1e6 / steps)} | "
             f"{_binding(scale, server, learner, held)} |"
         )
@@ -133,16 +145,18 @@ what the table names:
 
 _AT = """## On 10, 100 and 1,000 cores (predicted)
 
-One core each for the learner and every server, the rest are actors of 16 bats; batches of 64. *x20* is a learner 20
-times as fast as this core, as a GPU may be: assumed, not measured. *Free* is `replay.never_block`: nobody waits, and
-the ratio is what comes. *Held* is the share of their time in which actors wait for room.
+One core each for the learner and every server, the rest are actors of 16 bats. *x20* is a learner whose updates take a
+twentieth of the time that they take this core, as on a GPU: assumed, not measured. What its host does to take batches
+and to send priorities is as slow as here, and one after the other with the updates. *Free* is `replay.never_block`:
+nobody waits, and the ratio is what comes. *Held* is the share of their time in which actors wait for room.
 """
 
 _FOLLOWS = """\
-With the learner of one core more actors buy nothing at the default of 8 samples per insert: they wait for it. A
-faster learner is limited by the batches that a server gives; several servers do not lift that in proportion, because
-each takes part in every batch, but larger batches do: most of the cost of one of 64 does not grow with its size.
-Servers beyond the first pay for inserts, where few samples are drawn of each.
+With the learner of one core more actors buy nothing at the default of 8 samples per insert: they wait for it. With a
+faster device the learner's host, which takes batches and sends priorities, and the server that gives them come to cost
+as much as the update itself. Several servers do not lift that, because each takes part in every batch; larger batches
+do, because most of what a batch of 64 costs host and server does not grow with its size. Servers beyond the first pay
+for inserts, where few samples are drawn of each.
 """
 
 _SHARDS = """## Several replay servers
@@ -155,6 +169,9 @@ probability by which each item was really drawn, and `reader.misplaced_share` te
 have sent elsewhere. The law of samples per insert holds for all servers together: a batch is drawn by priorities, and
 charged to the servers by what their inserts have earned. The band cannot be narrower than one insert and one batch at
 each server, so that K servers have a wider one.
+
+Learning begins when one server has its part of `min_size`: its band lets a batch out, which is drawn from all servers.
+That is at about `min_size` transitions, because inserts go to the servers in turn, and earlier while some are away.
 
 A server that is lost is left out until it has come back from its snapshot: learner and actors go on with the others.
 Each server is a role of its own: `replay-0`, `replay-1`, with its snapshot, metrics and log. A serial run and a run on

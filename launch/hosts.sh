@@ -13,7 +13,7 @@ HEAD=${HEAD:-bat1}                       # EDIT: the host where training is star
 WORKERS=${WORKERS:-bat2 bat3}            # EDIT: the others
 FOLDER=${FOLDER:-apex_bat}               # EDIT: this project there, relative to the home folder
 PORT=${PORT:-6379}
-TOKEN=.ray/auth_token                    # relative to the home folder; made here on the first `up`
+TOKEN=.ray/auth_token                    # relative to the home folder; `up` makes one on the head where none is
 
 on() { # HOST COMMAND: standard input goes along
     if [ -n "${DRY:-}" ]; then echo "ssh $1 -- $2"; else ssh -o BatchMode=yes "$1" -- "$2"; fi
@@ -23,9 +23,11 @@ environment+=" RAY_worker_niceness=0 RAY_USAGE_STATS_ENABLED=0"
 
 case ${1:-} in
 up)
-    token=$(od -An -N32 -tx1 /dev/urandom | tr -d ' \n')
-    for host in $HEAD $WORKERS; do # by standard input: what stands in a command line, everybody on the host can read
-        printf %s "$token" | on "$host" "umask 077; mkdir -p ~/.ray; cat > ~/$TOKEN"
+    make="umask 077; mkdir -p ~/.ray; [ -s ~/$TOKEN ] || od -An -N32 -tx1 /dev/urandom | tr -d ' \n' > ~/$TOKEN"
+    token=$(on "$HEAD" "$make; cat ~/$TOKEN" </dev/null)
+    [ -z "${DRY:-}" ] || echo "$token"
+    for host in $WORKERS; do # by standard input: what stands in a command line, everybody on the host can read
+        on "$host" "umask 077; mkdir -p ~/.ray; cat > ~/$TOKEN" < <(printf %s "$token")
     done
     on "$HEAD" "$environment; ray start --head --port=$PORT --dashboard-host=127.0.0.1" </dev/null
     for host in $WORKERS; do

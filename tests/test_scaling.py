@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from apex_bat.config import Config
-from benchmarks.scaling import SCALES, Setup, predict
+from benchmarks.scaling import SCALES, Setup, at_speed, predict
 from benchmarks.scaling_costs import costs_of
 from benchmarks.scaling_model import Costs, Outcome, Run, Simulation
 from benchmarks.scaling_page import FILE, document
@@ -62,3 +62,15 @@ def test_the_settings_reach_the_model() -> None:
     assert few.steps_per_s == pytest.approx(64 / 15e-3 / 8, rel=0.1)
     assert Setup(4, 8.0).name == "ratio_8.actors_4"
     assert len({scale.name for scale in SCALES}) == len(SCALES)
+
+
+def test_a_faster_device_hastens_the_update_and_not_what_its_host_does() -> None:
+    costs = Costs(1.0, 1.0, 1.0, 1.0, update_s=8e-3, update_item_s=1e-4, take_s=3e-3, take_item_s=1e-5)
+    assert costs.learn_s(100) == pytest.approx(8e-3 + 10e-3 + 3e-3 + 1e-3)
+    assert at_speed(costs, 20.0).learn_s(100) == pytest.approx(18e-3 / 20 + 4e-3)
+
+
+def test_a_larger_batch_takes_the_learner_longer() -> None:
+    costs = COSTS._replace(update_s=5e-3, update_item_s=1e-4)
+    run = Run(actors=2, batch_size=200)
+    assert simulated(run, costs).updates_per_s == pytest.approx(1 / 25e-3, rel=0.02)

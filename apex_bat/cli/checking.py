@@ -50,9 +50,11 @@ def _check_inserts(config: Config) -> None:
     """Refuses settings with which the largest insert of an actor would be refused again and again."""
     capacity = config.replay.capacity // config.replay.shards
     if capacity < config.largest_insert:
+        shards = config.replay.shards
+        each = f", {capacity} at each of {shards} servers," if shards > 1 else ""
         raise ConfigError(
-            f"replay.capacity {config.replay.capacity} is less than the {config.largest_insert} transitions that the "
-            f"{config.bats_per_actor} bats of an actor may send at once; give more, or fewer bats_per_actor"
+            f"replay.capacity {config.replay.capacity}{each} is less than the {config.largest_insert} transitions that "
+            f"the {config.bats_per_actor} bats of an actor may send at once; give more, or fewer bats_per_actor"
         )
     needed_mb = config.largest_insert * _BYTES_A_TRANSITION / 2**20
     if config.transport.max_message_mb < needed_mb:

@@ -37,6 +37,7 @@ class RoleProcess:
         *,
         orders: bytes | None = None,
         folder: Path | None = None,
+        cleans: bool = True,
     ) -> None:
         """Starts it; its output is appended to `logs/NAME.log`.
 
@@ -49,11 +50,12 @@ class RoleProcess:
             lock: file descriptor of the run's lock, which the process keeps open as long as it lives.
             orders: the line that tells it addresses and keys, see `roles.orders`; None: it reads addresses.json.
             folder: to work in, where paths of the settings are relative to; None: that of this process.
+            cleans: whether to remove, once it has ended, the files that it was writing.
 
         Raises:
             OSError: it cannot be started.
         """
-        self._role, self._run = role, run
+        self._role, self._run, self._cleans = role, run, cleans
         self._log = run / "logs" / f"{role.name}.log"
         command = [sys.executable, "-m", "apex_bat", role.kind, "--run", str(run), "--leash",
                    "--number", str(role.number), "--incarnation", str(incarnation),
@@ -82,7 +84,7 @@ class RoleProcess:
     def tell(self, orders: bytes) -> None:
         """Writes a line of orders to a role that takes them; one that has ended does not hear it."""
         pipe = self._process.stdin
-        with suppress(BrokenPipeError, ValueError):  # closed by either end
+        with suppress(OSError, ValueError):  # closed by either end
             if pipe is not None:
                 pipe.write(orders)
                 pipe.flush()
@@ -92,13 +94,14 @@ class RoleProcess:
         code = self._process.poll()
         if code is None:
             return None
-        remove_unfinished(self._run, self._role, self.pid)
+        self._clean()
         return Exit(code, last_line(self._log))
 
     def stop(self) -> None:
         """Lets go of the leash."""
         if self._process.stdin is not None and not self._process.stdin.closed:
-            self._process.stdin.close()
+            with suppress(OSError):  # of orders that it did not read before it ended; the pipe is closed all the same
+                self._process.stdin.close()
 
     def kill(self) -> None:
         """Ends it at once and waits for it, for a moment; whether it is gone `poll` says."""
@@ -106,6 +109,10 @@ class RoleProcess:
         self._process.kill()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(KILL_TIMEOUT_S)
+            self._clean()
+
+    def _clean(self) -> None:
+        if self._cleans:
             remove_unfinished(self._run, self._role, self.pid)
 
 

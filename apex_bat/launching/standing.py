@@ -73,6 +73,11 @@ class Standing:
     def add(self, role: Role) -> None:
         """Counts a role more."""
         self.roles[role.name] = RoleStanding()
+        if role.kind == "actor":
+            self._recent = {
+                name: deque(recent, maxlen=(recent.maxlen or 0) + _RECENT_REPORTS)
+                for name, recent in self._recent.items()
+            }
 
     def take(self, report: Report, now_s: float) -> None:
         """Takes the report of a role; one of a role that the run does not have is ignored."""

@@ -2,8 +2,9 @@
 
 Two rings. *Rows* hold frame, action and step number of every step of a chunk, and are named by numbers that only grow;
 *items* are the transitions, named by permanent item numbers, so that a priority which comes late cannot land on another
-item. A row takes 194 bytes, an item 32 and 8.5 in the tree. Chunks of 50 transitions have 56 rows, and the ring a tenth
-in reserve, which makes 280 bytes a transition: 280 MB a million. With both states in each it would be 1,190.
+item (`ReplayStore.first_number` sees to it after a restart). A row takes 194 bytes, an item 32 and 8.5 in the tree.
+Chunks of 50 transitions have 56 rows, and the ring a tenth in reserve, which makes 280 bytes a transition: 280 MB a
+million. With both states in each it would be 1,190.
 
 Rows are written once: a snapshot can copy them while the buffer is in use (see `snapshot`).
 """

@@ -96,7 +96,7 @@ READER_METRICS: dict[str, Metric] = {
     "reader.ready": Metric("batches", "that lie ready"),
     "reader.waited_s": Metric("s", "that the learner spent waiting for a batch"),
     "reader.asked_again": Metric("requests", "sent again after a silence"),
-    "reader.dropped_updates": Metric("updates", "of priorities that could not be sent"),
+    "reader.dropped_updates": Metric("updates", "of priorities that could not be sent, to one server at least"),
     "reader.refused_messages": Metric("messages", "from the server that were no messages"),
     "reader.servers_away": Metric("servers", "of several that do not answer now; batches come from the others"),
     "reader.parts_drawn_again": Metric("parts", "of batches whose server was lost, drawn from the others"),

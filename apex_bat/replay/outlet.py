@@ -67,13 +67,13 @@ class Outlet:
         if request.size and len(self._store.buffer):
             sampled = self._store.draw(request.size, self._store.learner_step)
         self._store.count_sample(request.charge)
-        if sampled is None:
-            self._send(peer, self._standing(request.request, 0.0))
-        else:
-            standing = self._standing(request.request, sampled.largest_weight)
-            self._send(peer, Sample(request.request, sampled.batch, standing))
+        standing = self._standing(request.request, 0.0 if sampled is None else sampled.largest_weight)
+        answer = standing if sampled is None else Sample(request.request, sampled.batch, standing)
+        if not self._send(peer, answer):
+            self._store.count_sample(-request.charge)
 
     def _standing(self, request: int, largest_weight: float) -> Standing:
+        self._store.anneal()
         buffer, limiter = self._store.buffer, self._store.limiter
         return Standing(
             request, len(buffer), buffer.total, limiter.earned, self._store.beta, largest_weight,

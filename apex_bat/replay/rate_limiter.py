@@ -42,6 +42,7 @@ class RateLimiter:
         largest_insert: most transitions of one insert.
         largest_sample: most transitions of one sample.
         never_block: Ape-X's mode: only min_size is kept, the ratio is whatever the machine gives.
+        shards: servers whose bands make up `replay.error_buffer`; errors name the setting's figure.
 
     Raises:
         ValueError: both sides could come to wait for each other.
@@ -56,8 +57,10 @@ class RateLimiter:
         largest_insert: int,
         largest_sample: int,
         never_block: bool = False,
+        shards: int = 1,
     ) -> None:
         self.min_size = min_size
+        self._shards = shards
         self.never_block = never_block
         self._largest_insert = largest_insert
         self._largest_sample = largest_sample
@@ -166,10 +169,12 @@ class RateLimiter:
         if error_buffer is None:
             error_buffer = max(0.1 * self.min_size * samples_per_insert, least)
         if error_buffer < least and not self.never_block:
+            servers = f", shared out over {self._shards} servers" if self._shards > 1 else ""
             raise ValueError(
-                f"replay.error_buffer {error_buffer:g} is too narrow: with inserts of up to {self._largest_insert} "
-                f"transitions, {samples_per_insert:g} samples each, and batches of {self._largest_sample}, actors and "
-                f"learner could wait for each other for ever; give at least {least:g}"
+                f"replay.error_buffer {self._shards * error_buffer:g} is too narrow{servers}: with inserts of up to "
+                f"{self._largest_insert} transitions, {samples_per_insert:g} samples each, and batches of "
+                f"{self._largest_sample}, actors and learner could wait for each other for ever; "
+                f"give at least {self._shards * least:g}"
             )
         self.samples_per_insert = samples_per_insert
         self.error_buffer = error_buffer

@@ -76,10 +76,10 @@ class ReplayReader:
         self._arrived = threading.Condition()
         self._error: Exception | None = None
         self._stopping = False
-        self._move: tuple[list[str], list[int]] | None = None
+        self._moves: deque[tuple[list[str], list[int]]] = deque(maxlen=1)  # taken out whole, while another comes in
         self.waited_s = 0.0
         self.received = 0
-        self.dropped_updates = 0
+        self._crowded_out = self._unsent = 0  # updates; each counted by one thread only
         self.refused_messages = 0
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._alarm, self._alarmed = self._context.socket(zmq.PAIR), self._context.socket(zmq.PAIR)
@@ -113,14 +113,14 @@ class ReplayReader:
             raise ValueError(f"{len(priorities)} priorities for {len(items)} items")
         self._learner_step += 1
         if len(self._updates) == MAX_UPDATES:
-            self.dropped_updates += 1
+            self._crowded_out += 1
         self._updates.append((self._learner_step, items, priorities))
         if 2 * len(self._updates) >= self._prefetch:
             self._wake()
 
     def redirect(self, address: str | Sequence[str], generation: int | Sequence[int]) -> None:
         """Goes to the servers at other addresses from now on; what is outstanding is asked for there."""
-        self._move = endpoints(address, generation)
+        self._moves.append(endpoints(address, generation))
         self._wake()
 
     @property
@@ -141,7 +141,7 @@ class ReplayReader:
                 "reader.received": self.received,
                 "reader.ready": len(self._ready),
                 "reader.waited_s": self.waited_s,
-                "reader.dropped_updates": self.dropped_updates,
+                "reader.dropped_updates": self._crowded_out + self._unsent,
                 "reader.refused_messages": self.refused_messages,
             }
             | self._batches.counters()
@@ -191,8 +191,11 @@ class ReplayReader:
 
     def _follow(self) -> None:
         """Goes where the servers have gone, and asks them again for what the former ones owe."""
-        move, self._move = self._move, None
-        for number, (address, generation) in enumerate(zip(*move, strict=True) if move is not None else ()):
+        try:
+            move = self._moves.popleft()
+        except IndexError:
+            return
+        for number, (address, generation) in enumerate(zip(*move, strict=True)):
             connection = self._connections[number]
             if (address, generation) != (connection.address, self._generations[number]):
                 connection.redirect(address)
@@ -217,7 +220,7 @@ class ReplayReader:
                 continue
             local = (items[mine] // num_servers).astype(np.int64)
             is_sent &= self._send(number, PriorityUpdate(steps[-1], local, priorities[mine].astype(np.float32)))
-        self.dropped_updates += 0 if is_sent else len(updates)
+        self._unsent += 0 if is_sent else len(updates)
 
     def _receive(self, number: int, connection: Connection) -> None:
         while connection.socket.poll(0):

@@ -47,6 +47,8 @@ logger = logging.getLogger(__name__)
 RECEIVE_AT_ONCE = 64  # messages taken from the socket before those that wait are looked at
 WORK_S = 0.003  # time each for requests and for inserts that wait, before the socket is looked at again
 NOTICE_PERIOD_S = 0.5  # how often the held-back are told why; clients send again only when they hear nothing
+LIVES = 1 << 20  # of a server, whose items have numbers of their own
+ITEMS_OF_A_LIFE = 1 << 36  # numbers; with those of all lives and of 64 servers they are less than 2^63
 COPY_BELOW_BYTES = 65_536  # ZeroMQ sends larger messages without copying them
 
 
@@ -60,6 +62,7 @@ class ReplayServer:
         snapshot_path: file of the snapshots; None: none are made.
         keys: CURVE keys, for an address that is not loopback.
         generation: of this address; messages of another are refused.
+        life: another number for each start of the server in a run.
         clock: seconds, monotonic.
 
     Attributes:
@@ -80,10 +83,12 @@ class ReplayServer:
         *,
         keys: Keys | None = None,
         generation: int = 0,
+        life: int = 0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         keep_freed_memory()
         self.store = ReplayStore(config, generator)
+        self.store.first_number = life % LIVES * ITEMS_OF_A_LIFE
         self._refusals = Refusals(logger, clock)
         self._intake = Intake(config, self.store, self._refusals, self._send)
         self._outlet = Outlet(config, self.store, self._refusals, self._send)

@@ -36,6 +36,8 @@ def drawn_sizes(totals: Sequence[float], num_draws: int, generator: np.random.Ge
     The draws are stratified over all servers together as they are within one (`SumTree.sample`): one from each of
     `num_draws` equal parts of the sum of totals. The mean of each number is exactly its server's share.
     """
+    if not num_draws:
+        return np.zeros(len(totals), np.int64)
     ends = np.cumsum(totals)
     targets = (np.arange(num_draws) + generator.random(num_draws)) * (ends[-1] / num_draws)
     owners = np.searchsorted(ends, np.minimum(targets, np.nextafter(ends[-1], 0.0)), side="right")

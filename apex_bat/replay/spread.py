@@ -6,15 +6,16 @@ What they have earned since can only be more, so that this errs to the safe side
 law. Both cannot come to wait for each other: where a server holds inserts back it has earned at least a batch.
 
 A server that cannot be reached is left out: its parts of batches under way are drawn again from the others, in
-proportion to their totals, which leaves each of their items the probability it has without the lost one. It is asked
-how it stands until it answers, and takes part again from then on.
+proportion to their totals, which leaves each of their items the probability it has without the lost one. It is charged
+nothing meanwhile, is asked how it stands until it answers, and takes part again from then on.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from apex_bat.transport.messages import Message, PartRequest, Sample, Standing, 
 
 LOOK_S = 0.02  # between questions how a server stands while no batch can be begun
 CHECK_S = 0.25  # after which a server that owes an answer is asked whether it is there
+STUCK_S = 0.25  # after which a server that takes no message is lost; a full queue has usually emptied by then
 SMOOTHING = 0.01  # of the running mean over batches
 _log = logging.getLogger(__name__)
 
@@ -60,9 +62,12 @@ class _Server:
     def __init__(self) -> None:
         self.standing: Standing | None = None  # None: it is away
         self.outstanding: dict[int, _Share] = {}  # by request, in the order in which they were sent
+        self.last_sent = 0  # request; later ones wait for room in the queue, or for the connection
         self.asked_s = float("-inf")
         self.heard_s = float("-inf")
         self.owes_since_s = float("-inf")
+        self.stuck_since_s: float | None = None  # since when nothing could be sent
+        self.is_doubted = False
         self.reason = ""
 
     @property
@@ -98,7 +103,7 @@ class SpreadBatches:
         self._generator, self._clock = generator, clock
         self._servers = [_Server() for _ in range(num_servers)]
         self._gathering: dict[int, _Gathering] = {}
-        self._homeless: list[_Share] = []  # parts of lost servers that no other can give
+        self._lost: deque[_Share] = deque()  # parts that are to be drawn again
         self._last_batch = self._last_request = 0
         self._learner_step = 0
         self._wants_more = False
@@ -113,14 +118,20 @@ class SpreadBatches:
     @property
     def is_behind(self) -> bool:
         """Whether something is to be done soon, though nothing may come."""
-        return self._wants_more or bool(self._homeless) or any(server.standing is None for server in self._servers)
+        is_waited_for = any(each.standing is None or each.stuck_since_s is not None for each in self._servers)
+        return self._wants_more or bool(self._lost) or is_waited_for
 
     def ask(self, missing: int, learner_step: int) -> None:
-        """Begins up to so many batches, gives up lost servers, and asks how servers stand."""
+        """Begins up to so many batches, gives up lost servers, and asks how servers stand.
+
+        Call it soon again, with `take` for what has come meanwhile: a server is given up when it was silent in two
+        calls. So nobody loses servers by being stopped for a while itself.
+        """
         self._learner_step = learner_step
+        for number in range(len(self._servers)):
+            self._send_outstanding(number)
         self._look_for_the_lost()
-        homeless, self._homeless = self._homeless, []
-        self._draw_again(homeless)
+        self._draw_again()
         for _ in range(missing):
             if not self._can_draw() or sum(server.earned for server in self._servers) < self._batch_size:
                 break
@@ -145,13 +156,12 @@ class SpreadBatches:
             return None  # of a part that was given up meanwhile
         # A server answers in order: what was asked for before the answered one was lost.
         earlier = [request for request in server.outstanding if request < standing.request]
-        lost = [server.outstanding.pop(request) for request in earlier]
+        self._give_up(number, [server.outstanding.pop(request) for request in earlier])
         share = server.outstanding.pop(standing.request)
-        self._draw_again(lost)
         if isinstance(message, Sample):
             self._gathering[share.batch].parts.append((number, message.batch, standing))
         elif share.size:  # it holds nothing, but has counted the charge
-            self._draw_again([share._replace(charge=0)])
+            self._give_up(number, [share._replace(charge=0)])
             return None
         return self._settle(share.batch) if share.batch else None
 
@@ -192,23 +202,37 @@ class SpreadBatches:
         chances = whole.chance * np.array(totals) / sum(totals)
         batch.chances += chances
         sizes = drawn_sizes(totals, whole.size, self._generator).tolist()
-        charged = charges([server.earned for server in self._servers], whole.charge).tolist()
+        charged = self._charges(whole.charge)
         shares = [_Share(whole.batch, *each) for each in zip(sizes, charged, chances.tolist(), strict=True)]
-        asked = [(number, share) for number, share in enumerate(shares) if share.size or share.charge]
-        batch.missing += len(asked)  # before the first is sent, which may come to nothing
-        for number, share in asked:
-            self._request(number, share)
+        for number, share in enumerate(shares):
+            if share.size or share.charge:
+                batch.missing += 1
+                self._request(number, share)
 
-    def _draw_again(self, lost: list[_Share]) -> None:
-        """Draws lost parts from the servers that are there; keeps them where none is."""
-        for share in (share for share in lost if share.batch):
-            if not self._can_draw():
-                self._homeless.append(share)
-                continue
+    def _charges(self, amount: int) -> list[int]:
+        """Returns what each server is charged: nothing those that are away, which would never answer for it."""
+        there = [number for number, server in enumerate(self._servers) if server.standing is not None]
+        charged = np.zeros(len(self._servers), np.int64)
+        charged[there] = charges([self._servers[number].earned for number in there], amount)
+        return charged.tolist()
+
+    def _give_up(self, number: int, shares: Iterable[_Share]) -> None:
+        """Lets parts that a server owes be drawn again by the next `ask`."""
+        for share in shares:
+            if share.size:
+                # Its draws go to all servers anew, by chances of their own: none of the batch fell to it by this one.
+                self._gathering[share.batch].chances[number] -= share.chance
+                self._lost.append(share)
+            elif share.batch:  # without draws nothing of its chance is lost
+                self._lost.append(share._replace(chance=0.0))
+
+    def _draw_again(self) -> None:
+        """Draws lost parts from the servers that are there; they wait where none is."""
+        while self._lost and self._can_draw():
+            share = self._lost.popleft()
             self._drawn_again += 1
             self._gathering[share.batch].is_patched = True
-            # Without draws nothing of its chance is lost.
-            self._share_out(share if share.size else share._replace(chance=0.0))
+            self._share_out(share)
             self._gathering[share.batch].missing -= 1
 
     def _settle(self, number: int) -> Batch | None:
@@ -225,30 +249,44 @@ class SpreadBatches:
         return joined([DrawnPart(*part, float(batch.chances[part[0]])) for part in batch.parts], len(self._servers))
 
     def _request(self, number: int, share: _Share) -> None:
-        """Asks a server; one that cannot be reached is lost at once."""
+        """Asks a server, at once or as soon as it can be sent to."""
         server, now_s = self._servers[number], self._clock()
         self._last_request += 1
         if not server.outstanding:
             server.owes_since_s = now_s
         server.outstanding[self._last_request] = share
         server.asked_s = now_s
-        if not self._send(number, PartRequest(self._last_request, share.size, share.charge, self._learner_step)):
-            self._lose(number, "it cannot be reached")
+        self._send_outstanding(number)
+
+    def _send_outstanding(self, number: int) -> None:
+        """Sends a server in order what it was not sent, as far as its queue has room."""
+        server = self._servers[number]
+        for request in [request for request in server.outstanding if request > server.last_sent]:
+            share = server.outstanding[request]
+            if not self._send(number, PartRequest(request, share.size, share.charge, self._learner_step)):
+                server.stuck_since_s = self._clock() if server.stuck_since_s is None else server.stuck_since_s
+                return
+            server.last_sent = request
+        server.stuck_since_s = None
 
     def _lose(self, number: int, why: str) -> None:
         server = self._servers[number]
         if server.standing is not None:
             _log.warning("replay server %d: %s; batches are drawn from the others", number, why)
-        server.standing, server.reason = None, ""
+        server.standing, server.reason, server.stuck_since_s = None, "", None
         lost = list(server.outstanding.values())
         server.outstanding.clear()
-        self._draw_again(lost)
+        self._give_up(number, lost)
 
     def _look_for_the_lost(self) -> None:
         now_s = self._clock()
         for number, server in enumerate(self._servers):
-            if server.outstanding and now_s - max(server.heard_s, server.owes_since_s) > self._ask_again_s:
-                self._lose(number, "it does not answer")
+            silent_s = now_s - max(server.heard_s, server.owes_since_s) if server.outstanding else 0.0
+            is_stuck = server.stuck_since_s is not None and now_s - server.stuck_since_s > STUCK_S
+            is_missed = is_stuck or silent_s > self._ask_again_s
+            if is_missed and server.is_doubted:
+                self._lose(number, "it cannot be reached" if is_stuck else "it does not answer")
+            server.is_doubted = is_missed
 
     def _question(self) -> None:
         """Asks how servers stand: those that are away, all while nothing can be begun, and else now and then."""

@@ -45,6 +45,9 @@ class ReplayStore:
         buffer: the memory.
         limiter: the law of samples per insert.
         learner_step: updates of the learner, as its last message told.
+        first_number: what the items' numbers begin with outside. A store that goes on from an older snapshot gives
+            numbers again that were given since, so a server has others in each life: priorities that the learner sends
+            for items of an earlier life are late, and land on no other item.
     """
 
     def __init__(self, config: Config, generator: np.random.Generator) -> None:
@@ -60,6 +63,7 @@ class ReplayStore:
         self.limiter = limiter_of(config)
         self._has_action_memory = config.sensing.action_memory
         self.learner_step = 0
+        self.first_number = 0
         self._updated_priorities = 0
         self._late_priorities = 0
         self._refused_priorities = 0
@@ -111,7 +115,7 @@ class ReplayStore:
     def draw(self, num_transitions: int, learner_step: int) -> Sampled:
         """Returns a batch and what is known about it beside, as `sample` does."""
         self.learner_step = learner_step
-        self.buffer.set_alpha(self._alpha())
+        self.anneal()
         sampled = self.buffer.sample(num_transitions, self.beta, self._generator)
         lag = float(np.maximum(learner_step - sampled.learner_steps, 0).mean())
         age = float((self.buffer.counters.next_item - sampled.batch.items).mean())
@@ -122,7 +126,11 @@ class ReplayStore:
         if not self._has_action_memory:
             sampled.batch.states.actions[:] = 0
             sampled.batch.next_states.actions[:] = 0
-        return sampled
+        return sampled._replace(batch=sampled.batch._replace(items=sampled.batch.items + self.first_number))
+
+    def anneal(self) -> None:
+        """Sets the exponent of the priorities to that of the learner's step; `draw` does it too."""
+        self.buffer.set_alpha(self._alpha())
 
     def count_sample(self, num_transitions: int) -> None:
         """Counts a batch that was delivered."""
@@ -135,7 +143,7 @@ class ReplayStore:
         if not finite.all():
             self._refused_priorities += int(np.count_nonzero(~finite))
             items, errors = items[finite], errors[finite]
-        late = self.buffer.update(items, self._trusted(errors))
+        late = self.buffer.update(items - self.first_number, self._trusted(errors))
         self._late_priorities += late
         self._updated_priorities += len(items) - late
 
@@ -258,4 +266,5 @@ def limiter_of(config: Config) -> RateLimiter:
         largest_insert=config.largest_insert,
         largest_sample=config.learner.batch_size,
         never_block=settings.never_block,
+        shards=settings.shards,
     )

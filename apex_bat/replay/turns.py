@@ -26,7 +26,8 @@ class TurnWriter:
     Args:
         addresses: of the servers.
         actor: name, the same after a restart.
-        window_chunks: chunks that may be unacknowledged, of all servers together if none is away; each has its part.
+        window_chunks: chunks that may be unacknowledged, shared out over the servers evenly and rounded up. So it is
+            one for each server where there are more servers than chunks, and fewer than this while some are away.
         first: number of the server that gets the first insert; another one for each actor spreads what they send.
         keys: CURVE keys, for addresses that are not loopback.
         generation: of the addresses, or of each.

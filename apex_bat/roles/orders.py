@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from typing import Any
 
 import msgspec
@@ -54,7 +55,7 @@ class StandingOrders:
 
     def __init__(self) -> None:
         self._rest = b""
-        self._news: Addresses | None = None
+        self._news: deque[Addresses] = deque(maxlen=1)  # what is added meanwhile is not lost, as with a swap
         self._addresses: Addresses | None = None
         self._arrived = threading.Event()
         self.keys: Keys | None = None
@@ -75,7 +76,7 @@ class StandingOrders:
             if orders.keys is not None:
                 self.keys = _as_keys(orders.keys)
             if self._arrived.is_set():
-                self._news = orders.addresses
+                self._news.append(orders.addresses)
             else:
                 self._addresses = orders.addresses
                 self._arrived.set()
@@ -93,8 +94,10 @@ class StandingOrders:
 
     def moved(self) -> Addresses | None:
         """Returns the newest addresses if they have changed since the last call, else None."""
-        news, self._news = self._news, None
-        return news
+        try:
+            return self._news.popleft()
+        except IndexError:
+            return None
 
 
 def _as_text(keys: Keys) -> GivenKeys:

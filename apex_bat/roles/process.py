@@ -20,7 +20,7 @@ from apex_bat.roles.logs import RotatingLog
 from apex_bat.roles.orders import StandingOrders
 from apex_bat.roles.plan import Addresses, Assignment, Kind, Role, read_addresses, role_of
 from apex_bat.storage import StorageError
-from apex_bat.transport.security import TransportError
+from apex_bat.transport.security import AddressInUseError, TransportError
 
 ADDRESSES = "addresses.json"
 FAILED, USELESS = 1, 2
@@ -72,7 +72,8 @@ def run_process(
         return INTERRUPTED
     except (ConfigError, TransportError, StorageError, SnapshotError) as error:
         _log.error("%s", str(error).replace("\n", " "))  # one line, for a person
-        return USELESS
+        is_passing = is_ordered and isinstance(error, AddressInUseError)  # the next life is given another port
+        return FAILED if is_passing else USELESS
     except Exception:
         _log.exception("failed")
         return FAILED

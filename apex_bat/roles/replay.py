@@ -25,7 +25,7 @@ def run_replay(assignment: Assignment) -> None:
     address = assignment.addresses.replays[number]
     server = ReplayServer(
         assignment.config, address, assignment.generator(), path, keys=assignment.keys(),
-        generation=assignment.addresses.replay_generations[number],
+        generation=assignment.addresses.replay_generations[number], life=assignment.incarnation,
     )  # fmt: skip
     reporter = RoleReporter(assignment, address)
     try:

@@ -29,6 +29,10 @@ class TransportError(RuntimeError):
     """A socket or key cannot be used; the message is one line that says what and what to do."""
 
 
+class AddressInUseError(TransportError):
+    """Somebody else listens there, for the moment or for long."""
+
+
 class Keys(NamedTuple):
     """CURVE keys, Z85-encoded, 40 characters each."""
 

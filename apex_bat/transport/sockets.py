@@ -24,6 +24,7 @@ import zmq
 from apex_bat.config.settings import Transport
 from apex_bat.transport.refusals import Refusals
 from apex_bat.transport.security import (
+    AddressInUseError,
     Keys,
     TransportError,
     check_private,
@@ -279,7 +280,6 @@ def _bind(socket: Socket, address: str) -> str:
     except zmq.ZMQError as error:
         if error.errno == zmq.EADDRINUSE:
             reason = "the port is in use; choose another transport.base_port, or 0 for any free port"
-        else:
-            reason = f"cannot listen there: {error.strerror}"
-        raise TransportError(f"{address}: {reason}") from error
+            raise AddressInUseError(f"{address}: {reason}") from error
+        raise TransportError(f"{address}: cannot listen there: {error.strerror}") from error
     return socket.getsockopt_string(zmq.LAST_ENDPOINT)

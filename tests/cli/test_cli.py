@@ -25,6 +25,16 @@ from tests.cli.conftest import Command, Refused
         (["train", "--serial", "--set", "replay.shards=2"], 2, "replay.shards is 2, and a serial run has one replay"),
         (["train", "--set", "replay.error_buffer=9"], 2, "replay.error_buffer 9 is too narrow"),
         (["train", "--set", "replay.capacity=600", "--set", "replay.min_size=100"], 2, "less than the 848 transitions"),
+        (
+            ["train", "--set", "replay.shards=4", "--set", "replay.capacity=3000"],
+            2,
+            "replay.capacity 3000, 750 at each of 4 servers, is less than the 848 transitions",
+        ),
+        (
+            ["train", "--set", "replay.shards=2", "--set", "replay.error_buffer=90"],
+            2,
+            "replay.error_buffer 90 is too narrow, shared out over 2 servers",
+        ),
         (["train", "--set", "transport.max_message_mb=0.1"], 2, "less than the 0.83 MB"),
         (
             [

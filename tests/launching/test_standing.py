@@ -9,7 +9,7 @@ from apex_bat.config import Config, load
 from apex_bat.launching.live import PlainView, TerminalView, figures
 from apex_bat.launching.standing import Standing
 from apex_bat.launching.supervisor import Watched
-from apex_bat.roles.plan import roles_of
+from apex_bat.roles.plan import Role, roles_of
 from apex_bat.transport.messages import Report
 
 
@@ -105,3 +105,12 @@ def test_plain_lines_come_every_ten_seconds_and_in_one_line_each() -> None:
         for standing.now_s in (0.0, 5.0, 10.0, 19.0):
             view.show(standing, {})
     assert output.getvalue().count("\n") == 2
+
+
+def test_the_newest_returns_of_actors_that_join_count_as_those_of_the_first() -> None:
+    standing = standing_of(load(None, ["actors=1"]))
+    for number in range(1, 4):
+        standing.add(Role("actor", number))
+    for value in range(120):
+        standing.take(report("actor-0", {"return": float(value)}), 1.0)
+    assert standing.recent("return") == pytest.approx(sum(range(120)) / 120), "30 reports for each of 4 actors"

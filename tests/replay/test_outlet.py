@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -87,3 +88,26 @@ def test_a_batch_that_went_nowhere_is_not_counted(learner: Learner, make_chunk: 
     learner.is_there = False
     assert learner.ask(SampleRequest(1, 16, 0))
     assert learner.store.limiter.sampled == 0
+
+
+def test_a_part_that_went_nowhere_is_not_charged(learner: Learner, make_chunk: MakeChunk) -> None:
+    learner.store.add("a", 0, [make_chunk(20)])
+    learner.is_there = False
+    for size in (4, 0):
+        assert learner.ask(PartRequest(1 + size, size, 3, 0))
+    assert learner.store.limiter.sampled == 0
+
+
+def test_the_total_that_is_told_is_that_of_the_exponent_at_the_learners_step(
+    config: Config, make_chunk: MakeChunk
+) -> None:
+    replay = msgspec.structs.replace(config.replay, alpha=1.0, alpha_end=0.1, anneal_updates=100)
+    learner = Learner(msgspec.structs.replace(config, replay=replay))
+    learner.store.add("a", 0, [make_chunk(20)])
+    for step in (0, 100):
+        learner.ask(PartRequest(1 + step, 0, 0, step))
+    first, last = learner.got
+    assert isinstance(first, Standing)
+    assert isinstance(last, Standing)
+    priorities = learner.store.buffer.some_priorities(20).astype(np.float64)
+    assert (first.total, last.total) == pytest.approx((priorities.sum(), (priorities**0.1).sum()))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import msgspec
@@ -387,3 +387,28 @@ def test_a_snapshot_with_a_state_that_lies_is_refused(
             other.restore()
     finally:
         other.close()
+
+
+def test_a_priority_for_an_item_that_was_lost_with_an_earlier_life_lands_on_no_other(
+    config: Config, tmp_path: Path, make_chunk: MakeChunk
+) -> None:
+    def life(number: int) -> ReplayServer:
+        generator = np.random.default_rng(number)
+        return ReplayServer(config, "tcp://127.0.0.1:0", generator, tmp_path / "replay", life=number)
+
+    with closing(life(3)) as first:
+        first.store.add("a", 0, [make_chunk(20)])
+        first.save()
+        first.store.add("a", 0, [make_chunk(20)])
+        known = first.store.sample(40, 0).items
+    with closing(life(4)) as second:
+        assert "20 transitions" in second.restore()
+        second.store.add("a", 0, [make_chunk(20)])
+        before = second.store.buffer.some_priorities(40)
+        second.store.update(1, known, np.full(40, 9.0, np.float32))
+        np.testing.assert_array_equal(second.store.buffer.some_priorities(40), before)
+        assert second.metrics()["replay.late_priorities"] == 40
+        own = second.store.sample(40, 1).items
+        second.store.update(1, own, np.full(40, 9.0, np.float32))
+        assert second.metrics()["replay.late_priorities"] == 40
+        assert second.metrics()["replay.updated_priorities"] == 40

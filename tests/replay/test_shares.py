@@ -25,6 +25,11 @@ def test_sizes_are_the_shares_of_the_totals_in_the_mean_and_within_one_draw(gene
     assert not drawn[:, 1].any()
 
 
+@pytest.mark.filterwarnings("error")
+def test_of_no_draws_none_falls_to_anybody(generator: np.random.Generator) -> None:
+    np.testing.assert_array_equal(drawn_sizes([3.0, 1.0], 0, generator), [0, 0])
+
+
 def test_charges_add_up_level_the_servers_and_overdraw_none(generator: np.random.Generator) -> None:
     for _ in range(500):
         earned = generator.integers(0, 200, generator.integers(1, 9))

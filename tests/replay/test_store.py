@@ -11,7 +11,7 @@ import pytest
 from apex_bat.config.settings import Config
 from apex_bat.experience import Chunk
 from apex_bat.replay.metrics import PRIORITY_BINS, SHARED_ACTORS
-from apex_bat.replay.store import RefusedChunkError, ReplayStore
+from apex_bat.replay.store import RefusedChunkError, ReplayStore, limiter_of
 
 MakeChunk = Callable[..., Chunk]
 
@@ -168,3 +168,12 @@ def test_a_law_that_was_changed_holds_on_after_a_restore(config: Config, make_ch
     other.restore(store.state())
     assert other.limiter.law == store.limiter.law
     assert other.limiter.balance == store.limiter.balance
+
+
+def test_the_least_band_that_an_error_names_is_that_of_all_servers(config: Config) -> None:
+    with pytest.raises(ValueError, match="buffer 3 is too narrow, shared out over 3 servers") as error:
+        limiter_of(with_replay(config, shards=3, error_buffer=3.0))
+    least = float(str(error.value).rpartition(" ")[2])
+    assert limiter_of(with_replay(config, shards=3, error_buffer=least)).error_buffer == pytest.approx(least / 3)
+    with pytest.raises(ValueError, match="too narrow"):
+        limiter_of(with_replay(config, shards=3, error_buffer=least - 1))

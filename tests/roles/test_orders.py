@@ -1,6 +1,7 @@
 """Orders on standard input: addresses, keys, news, and what is none."""
 
 import logging
+import threading
 
 import pytest
 
@@ -66,3 +67,27 @@ def test_a_secret_is_in_no_text_of_the_keys() -> None:
     keys = new_keys()
     given = GivenKeys("a", "b", keys.client_secret.decode(), None, [])
     assert keys.client_secret.decode() not in f"{given!r} {given}"
+
+
+def test_news_that_comes_while_news_is_taken_is_not_lost() -> None:
+    """A swap of two names would lose what is written between its two halves."""
+    orders = StandingOrders()
+    orders.heed(line_of(FIRST))
+    ended, taken = threading.Event(), []
+    last = 500
+
+    def take() -> None:
+        while not ended.is_set():
+            if (news := orders.moved()) is not None:
+                taken.append(news.replay_generation)
+
+    thread = threading.Thread(target=take)
+    thread.start()
+    for generation in range(last + 1):
+        orders.heed(line_of(Addresses("a", "b", "c", replay_generation=generation)))
+    ended.set()
+    thread.join()
+    if (news := orders.moved()) is not None:
+        taken.append(news.replay_generation)
+    assert taken[-1] == last
+    assert taken == sorted(set(taken)), "each once, in their order"

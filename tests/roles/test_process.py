@@ -3,12 +3,15 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from apex_bat.config import load
@@ -203,3 +206,42 @@ def test_a_role_takes_addresses_and_keys_from_its_leash_and_leaves_no_key_behind
     finally:
         process.kill()
         collector.close()
+
+
+@pytest.mark.parametrize(("is_ordered", "code"), [(True, 1), (False, 2)])
+def test_a_port_in_use_is_tried_again_where_the_next_life_is_given_another_one(
+    is_ordered: bool, code: int, run: Path
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        addresses = Addresses(address, "", f"ipc://{run / 'sockets' / 'reports'}")
+        if not is_ordered:
+            (run / "addresses.json").write_bytes(msgspec.json.encode(addresses))
+        process = RoleProcess(Role("replay", 0), run, 0, 1, orders=line_of(addresses) if is_ordered else None)
+        try:
+            assert ended(process) == code
+        finally:
+            process.kill()
+    result = process.poll()
+    assert result is not None
+    assert "the port is in use" in result.detail
+
+
+def test_orders_that_a_dead_process_did_not_read_hinder_nobody_from_ending_it(run: Path) -> None:
+    process = RoleProcess(Role("replay", 0), run, 0, 1, cleans=False)
+    left = run / "replay" / "replay.snapshot.writing"
+    try:
+        os.kill(process.pid, signal.SIGKILL)
+        assert ended(process) == -signal.SIGKILL
+        left.touch()
+        pipe = process._process.stdin
+        assert pipe is not None
+        with suppress(BrokenPipeError):  # what is told in the moment of its death stays in the buffer
+            pipe.write(b"x")
+            pipe.flush()
+        process.stop()
+        process.kill()
+        assert pipe.closed
+        assert left.exists(), "whoever made it said that it is not to clean"
+    finally:
+        process.kill()

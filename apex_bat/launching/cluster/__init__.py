@@ -1,1 +1,1 @@
-"""Roles on the nodes of a Ray cluster: places, keepers, leases, addresses that move. Only `ray_cluster` knows Ray."""
+"""Roles on the nodes of a Ray cluster: places, keepers, leases, addresses. Only modules named `ray_` know Ray."""

@@ -1,11 +1,12 @@
 """What keeps one role on a host of a cluster: starts its process, looks after it, ends it when the lease lapses.
 
-A keeper knows nothing of Ray; `ray_cluster` runs one in each Ray actor. The role is a process of its own beneath it, as
+A keeper knows nothing of Ray; `ray_keepers` runs one in each Ray actor. The role is a process of its own beneath it, as
 on one machine: it has its own main thread, log, number of threads and exit code, and it ends when the keeper is gone.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import platform
 import socket
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import apex_bat
-from apex_bat.launching.cluster.lease import Lease
+from apex_bat.launching.cluster.lease import Lease, clock_s
 from apex_bat.launching.processes import RoleProcess
 from apex_bat.roles.plan import Role
 
@@ -27,6 +28,9 @@ MARK = ".same-folder"
 """File in the run folder by which a keeper tells that its host sees the launcher's folder."""
 PATIENCE_S = 5.0
 """How long a keeper waits for the mark: network drives show new files late."""
+NUM_PORTS = 100
+"""Ports from `transport.base_port` on that may be taken."""
+_log = logging.getLogger(__name__)
 
 
 class Site(NamedTuple):
@@ -37,7 +41,7 @@ class Site(NamedTuple):
     address: str
     """IP address at which the other nodes reach it."""
     port: int
-    """A TCP port that is free there now."""
+    """A TCP port that is free there now; 0 for a role that listens nowhere."""
     problem: str
     """Why no role can be started there; empty if one can."""
 
@@ -68,7 +72,7 @@ class Keeper:
         lease_s: float,
         address: str,
         base_port: int = 0,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = clock_s,
     ) -> None:
         """Begins its lease; starts nothing yet.
 
@@ -91,15 +95,20 @@ class Keeper:
         self._thread = threading.Thread(target=self._watch_lease, name="lease", daemon=True)
         self._thread.start()
 
-    def site(self, versions: tuple[str, str]) -> Site:
+    def site(self, versions: tuple[str, str], role: Role) -> Site:
         """Returns where this is, with a port that is free now.
 
         Args:
             versions: what `versions_here` returned to the launcher.
+            role: that is to be started here.
+
+        Raises:
+            OSError: no port is free.
         """
         problem = "" if versions == versions_here() else f"versions differ: {versions_here()} here, {versions} there"
         problem = problem or self._foreign_folder()
-        port = 0 if problem else free_port(self._address, self._base_port)
+        listens = role.kind in ("replay", "learner")
+        port = free_port(self._address, self._base_port, first_port(role)) if listens and not problem else 0
         return Site(socket.gethostname(), self._address, port, problem)
 
     def start(self, life: int, role: Role, incarnation: int, num_threads: int, flown_steps: int, orders: bytes) -> int:
@@ -124,8 +133,9 @@ class Keeper:
             return 0
         _show_package_to_children()
         self._process = RoleProcess(
-            role, self._run, incarnation, num_threads, flown_steps, orders=orders, folder=self._folder
-        )
+            role, self._run, incarnation, num_threads, flown_steps, orders=orders, folder=self._folder,
+            cleans=False,  # this may come when the role works elsewhere, and the folder is the same
+        )  # fmt: skip
         self._life, self._has_lapsed = life, False
         return self._process.pid
 
@@ -170,10 +180,13 @@ class Keeper:
         One that is told to end would write its last files beside those of its replacement.
         """
         while not self._is_closed.wait(LOOK_S):
-            process = self._process
-            if process is not None and self._lease.has_lapsed and process.poll() is None:
-                self._has_lapsed = True
-                process.kill()
+            try:
+                process = self._process
+                if process is not None and self._lease.has_lapsed and process.poll() is None:
+                    self._has_lapsed = True
+                    process.kill()
+            except Exception:  # whatever it is: without this thread the role would outlive its lease
+                _log.exception("lease: looks again")
 
     def _foreign_folder(self) -> str:
         """Returns a complaint if this host does not see the launcher's run folder, else an empty text."""
@@ -198,16 +211,35 @@ def versions_here() -> tuple[str, str]:
     return apex_bat.__version__, ".".join(platform.python_version_tuple()[:2])
 
 
-def free_port(address: str, base_port: int = 0) -> int:
-    """Returns a TCP port that is free now, from `base_port` on; 0: any. Another process could take it first."""
-    for port in range(base_port, base_port + 100) if base_port else (0,):
+def first_port(role: Role) -> int:
+    """Returns which of the ports from `transport.base_port` on a server tries first.
+
+    Each its own, or two servers that look for one on the same host at the same time would find the same. The launcher
+    begins with the first of all.
+    """
+    return NUM_PORTS // 3 if role.kind == "learner" else 2 * NUM_PORTS // 3 + role.number
+
+
+def free_port(address: str, base_port: int = 0, first: int = 0) -> int:
+    """Returns a TCP port that is free now. Another process could take it before it is bound.
+
+    Args:
+        address: where to listen.
+        base_port: first of the NUM_PORTS ports that are allowed; 0: any port.
+        first: which of these is tried first; after the last comes the first.
+
+    Raises:
+        OSError: none is free.
+    """
+    for port in [base_port + (first + i) % NUM_PORTS for i in range(NUM_PORTS)] if base_port else (0,):
         with socket.socket() as one:
             try:
                 one.bind((address, port))
             except OSError:
                 continue
             return int(one.getsockname()[1])
-    raise OSError(f"{address}: none of the ports {base_port} to {base_port + 99} is free; set transport.base_port")
+    last_port = base_port + NUM_PORTS - 1
+    raise OSError(f"{address}: none of the ports {base_port} to {last_port} is free; set transport.base_port")
 
 
 def _show_package_to_children() -> None:

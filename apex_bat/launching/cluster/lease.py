@@ -8,10 +8,20 @@ long a look was under way: one that a network delivers after a cut of minutes na
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 MARGIN_S = 0.5
 """What the launcher waits beyond: for the keeper's kill to be done, and for clocks that run unequally fast."""
+
+
+def clock_s() -> float:
+    """Returns seconds that never go backwards and that go on while the machine sleeps, where the system counts those.
+
+    `time.monotonic` stands still meanwhile. The launcher counts by that: its own sleep makes it wait the longer.
+    """
+    boot_time = getattr(time, "CLOCK_BOOTTIME", None)
+    return time.monotonic() if boot_time is None else time.clock_gettime(boot_time)
 
 
 class Lease:
@@ -49,12 +59,31 @@ class Hearing:
         """Number of the newest answer."""
         self.heard_s: float | None = None
         """When it came; None before the first."""
+        self.lost_s: float | None = None
+        """When it was known that the keeper is gone; None while it is not."""
+        self.may_run = False
+        """Whether a role was ever ordered to start there: an order whose answer was an error may have come through."""
 
     def take(self, now_s: float, number: int | None = None) -> None:
         """Notes an answer: `number` if it is one to a look, None to another call, which prolongs no lease."""
         self.heard_s = now_s
         if number is not None:
             self.seen = number
+
+    def take_loss(self, now_s: float) -> None:
+        """Notes that the keeper is gone."""
+        if self.lost_s is None:
+            self.lost_s = now_s
+
+    def gone_s(self, grace_s: float) -> float:
+        """Returns from when on nothing runs there that was started by a keeper that is gone; infinite if it is not.
+
+        A dead keeper enforces no lease. Its end is the end of its role's leash, which has `grace_s` for its last files;
+        and the keeper may have died just before that was known.
+        """
+        if self.lost_s is None:
+            return float("inf")
+        return self.lost_s + grace_s + MARGIN_S if self.may_run else self.lost_s
 
     def is_over(self, now_s: float) -> bool:
         """Whether the keeper's lease has ended for certain."""

@@ -9,8 +9,8 @@ from typing import Literal
 
 from apex_bat.config import Config
 from apex_bat.launching.cluster.keeper import Look, Site
-from apex_bat.launching.cluster.lease import MARGIN_S, Hearing
-from apex_bat.launching.supervisor import USELESS, Exit
+from apex_bat.launching.cluster.lease import Hearing
+from apex_bat.launching.supervisor import TEMPORARY, USELESS, Exit
 from apex_bat.roles.plan import Role
 
 _KILLED = -int(getattr(signal, "SIGKILL", 9))
@@ -58,9 +58,14 @@ class Placed:
             self._exit = Exit(USELESS, f"{self.role.name} on {site.host}: {site.problem}")
         return not site.problem
 
+    def take_useless(self, site: Site) -> None:
+        """Notes a place where it cannot be started, which is not worth the end of the run: it waits there."""
+        self._host = site.host
+        self.waiting = f"not started on {site.host}: {site.problem}"
+
     def begin(self) -> None:
         """Notes that the order to start it has gone."""
-        self._is_started, self.waiting = True, ""
+        self._is_started, self._hearing.may_run, self.waiting = True, True, ""
 
     def take_start(self, pid: int) -> None:
         """Notes its process; 0: the keeper had not heard us for too long to start one."""
@@ -76,12 +81,18 @@ class Placed:
                 self._exit = Exit(look.code, look.detail)
 
     def take_error(self, error: Exception) -> None:
-        """Notes that the process could not be started; an OSError may pass by itself, another counts as a failure."""
-        self._exit = Exit(None if isinstance(error, OSError) else 1, f"on {self._host}: {error}")
+        """Notes that the process could not be started.
+
+        An OSError without a number, or with one of those that pass by themselves, is no failure of the role.
+        """
+        passes = isinstance(error, OSError) and (error.errno is None or error.errno in TEMPORARY)
+        text = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        self._exit = Exit(None if passes else 1, f"on {self._host}: {text}")
 
     def take_loss(self, detail: str) -> None:
         """Notes that its keeper is gone."""
         self._lost = self._lost or detail
+        self._hearing.take_loss(self._clock())
 
     @property
     def is_over(self) -> bool:
@@ -95,8 +106,9 @@ class Placed:
         heard_s = self._hearing.heard_s
         if self._lost and heard_s is None:  # it never worked: what is wrong may well be wrong everywhere
             self._exit = Exit(1, self._lost)
-        elif self._lost and self._is_gone_for_certain(heard_s or 0.0):
-            self._exit = Exit(_KILLED, f"{self._host}: {self._lost}", is_lost=True)
+        elif self._lost:  # then the lease says nothing: nobody is there to enforce it
+            if self._is_gone_for_certain():
+                self._exit = Exit(_KILLED, f"{self._host}: {self._lost}", is_lost=True)
         elif self._hearing.is_over(self._clock()):
             lease_s = self._config.cluster.lease_s
             self._exit = Exit(_KILLED, f"{self._host}: not heard for {lease_s:g} s", is_lost=True)
@@ -116,13 +128,9 @@ class Placed:
         elif self._exit is None:
             self._exit = Exit(_KILLED, "")
 
-    def _is_gone_for_certain(self, heard_s: float) -> bool:
-        """Whether it has ended although nobody could say so.
+    def _is_gone_for_certain(self) -> bool:
+        """Whether all that was started on its lost keeper has ended, although nobody could say so.
 
-        The end of its keeper is the end of its leash: it may write its last files for `launch.grace_s`, which those of
-        its replacement must not meet. Actors write nothing that counts.
+        The last files of that must not meet those of the replacement. Actors write nothing that counts.
         """
-        if not self._is_started or self.role.kind == "actor":
-            return True
-        wait_s = min(self._config.launch.grace_s, self._config.cluster.lease_s) + MARGIN_S
-        return self._clock() >= heard_s + wait_s
+        return self.role.kind == "actor" or self._clock() >= self._hearing.gone_s(self._config.launch.grace_s)

@@ -47,6 +47,11 @@ def core_roles(config: Config) -> list[Role]:
     return [role for role in roles_of(config) if role.kind != "actor"]
 
 
+def reserved_roles(config: Config) -> list[Role]:
+    """Returns the roles whose places are reserved: those without which there is no run, and one actor to fly in it."""
+    return [*core_roles(config), Role("actor", 0)]
+
+
 def num_places_beside(core: Sequence[Resources], demand: Resources, nodes: Sequence[Mapping[str, float]]) -> int:
     """Returns how often a demand fits into what nodes have when each of `core` has found a place first."""
     free = [dict(node) for node in nodes]

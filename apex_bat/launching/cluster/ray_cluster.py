@@ -1,8 +1,7 @@
 """Training on a Ray cluster: the same roles, watched by the same supervisor, in places that Ray finds.
 
 Ray does two things: it finds places, and it carries the calls to a keeper in each of them. Experience, batches, weights
-and reports go by ZeroMQ as on one machine. Restarts are decided by the supervisor (Ray knows neither backoff nor exit
-codes), so actors of Ray are never restarted by Ray itself.
+and reports go by ZeroMQ as on one machine.
 """
 
 from __future__ import annotations
@@ -18,18 +17,13 @@ from typing import Any
 
 import ray
 from ray._private import worker
-from ray.util.placement_group import (
-    PlacementGroup,
-    placement_group,
-    placement_group_table,
-    remove_placement_group,
-)
-from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
+from ray.util.placement_group import PlacementGroup, placement_group, remove_placement_group
 
 from apex_bat.config import Config
 from apex_bat.config.settings import MOST_ACTORS
-from apex_bat.launching.cluster.fleet import Fleet, LostError, Remote
-from apex_bat.launching.cluster.keeper import MARK, Keeper, Look, Site, free_port
+from apex_bat.launching.cluster.fleet import Fleet
+from apex_bat.launching.cluster.keeper import MARK, free_port
+from apex_bat.launching.cluster.lease import MARGIN_S
 from apex_bat.launching.cluster.placement import (
     ClusterError,
     Resources,
@@ -38,22 +32,25 @@ from apex_bat.launching.cluster.placement import (
     demand_of,
     num_places,
     num_places_beside,
+    reserved_roles,
     shortage,
 )
+from apex_bat.launching.cluster.ray_keepers import RayPlacer, own_address
 from apex_bat.launching.course import Course, Ended
 from apex_bat.launching.live import View
 from apex_bat.launching.local import terminable
 from apex_bat.launching.standing import NEW_RUN, Origin
+from apex_bat.launching.status import STATUS, read_status
 from apex_bat.roles.logs import launcher_log
 from apex_bat.roles.plan import Role, roles_of
-from apex_bat.storage import write_text
+from apex_bat.roles.process import ADDRESSES
+from apex_bat.storage import StorageError, write_text
 from apex_bat.transport.reports import ReportCollector
 from apex_bat.transport.security import Keys, load_keys, new_keys
 
 _QUIET_S = 2.0  # a place that is found within it is not worth a line
 _LOOK_S = 0.2
 _MOST_AT_ONCE = 16  # actors added by one look
-_own_address: Callable[[], str] = ray.util.get_node_ip_address
 _free: Callable[[], Resources] = ray.available_resources
 _all_nodes: Callable[[], list[dict[str, Any]]] = ray.nodes
 _log = logging.getLogger(__name__)
@@ -109,87 +106,14 @@ def train(config: Config, run: Path, view: View, *, origin: Origin = NEW_RUN, pa
     run = run.resolve()
     with terminable(), launcher_log(run, config.launch):  # after `ray.init`, which takes SIGTERM for itself
         keys = load_keys(Path(config.transport.keys)) if config.transport.keys else new_keys()
-        with _marked(run) as mark, _places(config) as group:
+        _await_leases(config, run)
+        with _marked(run) as mark, _places(config) as (group, demands):
             collector = _collector(config, keys)
-            placer = _Placer(config, run, mark, group)
-            with Fleet(config, collector, keys, placer) as fleet:
+            (run / ADDRESSES).unlink(missing_ok=True)  # of a former part of the run
+            placer = RayPlacer(config, run, mark, group, demands)
+            with Fleet(config, run, collector, keys, placer) as fleet:
                 growth = _Growth(config, fleet)
                 return Course(config, run, collector, fleet.start, origin, part, growth.more).go(view)
-
-
-@ray.remote
-class _RemoteKeeper:
-    """A keeper in an actor of Ray."""
-
-    def __init__(self, run: str, mark: str, folder: str, lease_s: float, base_port: int) -> None:
-        address = _own_address()
-        self._keeper = Keeper(run, mark, folder, lease_s, address, base_port)
-
-    def site(self, versions: tuple[str, str]) -> Site:
-        return self._keeper.site(versions)
-
-    def start(self, *given: Any) -> int:
-        return self._keeper.start(*given)
-
-    def look(self, seen: int, orders: bytes | None) -> Look:
-        return self._keeper.look(seen, orders)
-
-    def stop(self) -> None:
-        self._keeper.stop()
-
-    def kill(self) -> None:
-        self._keeper.kill()
-
-
-class _Placer:
-    """Makes keepers: those of replay, learner and evaluator in the placement group, actors spread over the rest."""
-
-    def __init__(self, config: Config, run: Path, mark: str, group: PlacementGroup) -> None:
-        self._config, self._group = config, group
-        self._given = (str(run), mark, str(Path.cwd()), config.cluster.lease_s, config.transport.base_port)
-        self._bundles = {role.name: index for index, role in enumerate(core_roles(config))}
-
-    def asks(self, role: Role) -> str:
-        """Returns what a role asks of the cluster, as text."""
-        return as_text(self._demand(role))
-
-    def place(self, role: Role) -> Remote:
-        """Asks for a place with a keeper; returns at once."""
-        demand = dict(self._demand(role))
-        strategy: Any = "SPREAD"
-        if role.name in self._bundles:
-            strategy = PlacementGroupSchedulingStrategy(self._group, self._bundles[role.name])
-        options: dict[str, Any] = {"num_cpus": demand.pop("CPU"), "num_gpus": demand.pop("GPU", 0)}
-        if memory := demand.pop("memory", 0.0):
-            options["memory"] = int(memory)
-        keeper = _RemoteKeeper.options(  # type: ignore[attr-defined]
-            resources=demand, scheduling_strategy=strategy, max_restarts=0, max_task_retries=0, **options
-        ).remote(*self._given)
-        return _RayRemote(keeper)
-
-    def is_short(self) -> bool:
-        """Whether Ray looks for places anew for the group, because a node is gone that had one."""
-        return str(placement_group_table(self._group).get("state")) != "CREATED"
-
-    def answers(self, tickets: list[object], timeout_s: float) -> Iterator[tuple[object, object]]:
-        """Yields ticket and answer, or the error, of those that are answered within the time."""
-        if not tickets:
-            time.sleep(timeout_s)
-            return
-        ready, _ = ray.wait(tickets, num_returns=len(tickets), timeout=timeout_s)
-        for ticket in ready:
-            try:
-                yield ticket, ray.get(ticket)
-            except ray.exceptions.ActorUnavailableError:  # for the moment; the call may have come through or not
-                yield ticket, OSError("its host does not answer")
-            except ray.exceptions.RayTaskError as error:
-                kind = OSError if isinstance(error.cause, OSError) else RuntimeError
-                yield ticket, kind(_reason(error))
-            except ray.exceptions.RayError as error:
-                yield ticket, LostError(_reason(error))
-
-    def _demand(self, role: Role) -> Resources:
-        return demand_of(role, self._config, _has_gpu(_nodes()))
 
 
 class _Growth:
@@ -212,19 +136,6 @@ class _Growth:
         return roles
 
 
-class _RayRemote:
-    """Calls to one keeper; each returns a ticket at once."""
-
-    def __init__(self, keeper: Any) -> None:
-        self._keeper = keeper
-
-    def call(self, method: str, *given: object) -> object:
-        return getattr(self._keeper, method).remote(*given)
-
-    def dismiss(self) -> None:
-        ray.kill(self._keeper, no_restart=True)
-
-
 @contextmanager
 def _marked(run: Path) -> Iterator[str]:
     """Yields what a file in the run folder holds meanwhile, by which keepers know that folder."""
@@ -237,18 +148,18 @@ def _marked(run: Path) -> Iterator[str]:
 
 
 @contextmanager
-def _places(config: Config) -> Iterator[PlacementGroup]:
-    """Yields a placement group that holds places for all roles but the actors.
+def _places(config: Config) -> Iterator[tuple[PlacementGroup, dict[str, Resources]]]:
+    """Yields a placement group that holds the places of some roles, and what these ask, in the order of its places.
 
     Raises:
         ClusterError: the cluster has none, after `cluster.wait_s`.
     """
     nodes = _nodes()
-    demands = {role.name: demand_of(role, config, _has_gpu(nodes)) for role in core_roles(config)}
+    demands = {role.name: demand_of(role, config, _has_gpu(nodes)) for role in reserved_roles(config)}
     group = placement_group(list(demands.values()), strategy="PACK")  # the most goes between replay and learner
     try:
         _await_places(group, demands, config)
-        yield group
+        yield group, demands
     finally:
         if ray.is_initialized():
             remove_placement_group(group)
@@ -269,6 +180,18 @@ def _await_places(group: PlacementGroup, demands: dict[str, Resources], config: 
             )
 
 
+def _await_leases(config: Config, run: Path) -> None:
+    """Waits until nothing of a former part of the run lives whose launcher cannot say that it has ended."""
+    try:
+        has_ended = read_status(run)["launcher"] == "ended"
+    except StorageError:  # of a new run there is none
+        has_ended = not (run / STATUS).exists()
+    if not has_ended:
+        wait_s = max(config.cluster.lease_s, config.launch.grace_s) + MARGIN_S
+        _log.warning("the former launcher did not end the run: waits %.0f s for what it may have left running", wait_s)
+        time.sleep(wait_s)
+
+
 def _note(data: dict[str, Any], **_: object) -> None:
     """Notes in the log, as one line, what Ray would print of dying nodes: hundreds of lines, whatever it is told."""
     first = next((line for line in "\n".join(map(str, data.get("lines", ()))).splitlines() if line.strip()), "")
@@ -281,7 +204,7 @@ def _shortage(demands: dict[str, Resources]) -> str:
 
 
 def _collector(config: Config, keys: Keys) -> ReportCollector:
-    address = _own_address()
+    address = own_address()
     port = free_port(address, config.transport.base_port)
     names = [role.name for role in roles_of(config)]
     return ReportCollector(f"tcp://{address}:{port}", keys=keys, generation=secrets.randbits(63), roles=names)
@@ -294,9 +217,3 @@ def _nodes() -> list[Resources]:
 
 def _has_gpu(nodes: list[Resources]) -> bool:
     return any(node.get("GPU", 0.0) > 0.0 for node in nodes)
-
-
-def _reason(error: Exception) -> str:
-    """Returns the last line of an error of Ray that says something, without the traceback that it carries."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else type(error).__name__

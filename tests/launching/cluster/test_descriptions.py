@@ -96,18 +96,43 @@ def test_the_job_of_kuberay_is_whole() -> None:
 
 @needs_bash
 def test_hosts_are_entered_in_order_and_the_token_is_in_no_command_line(tmp_path: Path) -> None:
-    _fake(tmp_path, "ssh", f'echo "$@" >> {tmp_path}/calls; cat > {tmp_path}/input-$RANDOM')
-    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "HEAD": "a", "WORKERS": "b c"}
-    subprocess.run([BASH, str(LAUNCH / "hosts.sh"), "up"], env=environment, check=True, timeout=30)
+    assert not hosts_up(tmp_path)
     calls = (tmp_path / "calls").read_text()
     order = [line.split("--")[0].split()[-1] for line in calls.splitlines() if "BatchMode" in line]
     assert order == ["a", "b", "c", "a", "b", "c"]
-    tokens = {path.read_text() for path in tmp_path.glob("input-*")} - {""}
-    assert len(tokens) == 1
-    assert len(tokens.pop()) == 64
-    assert not [word for word in calls.split() if len(word) == 64]
+    tokens = [(tmp_path / f"home-{host}/.ray/auth_token").read_text() for host in "abc"]
+    assert len(set(tokens)) == 1
+    assert len(tokens[0]) == 64
+    assert tokens[0] not in calls
+    assert (tmp_path / "home-b/.ray/auth_token").stat().st_mode & 0o777 == 0o600
     assert "ray start --head" in calls
     assert "ray start --address=" in calls
+
+
+@needs_bash
+def test_a_token_that_the_head_has_is_kept_and_given_to_the_others(tmp_path: Path) -> None:
+    token = tmp_path / "home-a" / ".ray" / "auth_token"
+    token.parent.mkdir(parents=True)
+    token.write_text("of a cluster that runs")
+    hosts_up(tmp_path)
+    assert token.read_text() == "of a cluster that runs"
+    assert (tmp_path / "home-c/.ray/auth_token").read_text() == "of a cluster that runs"
+
+
+@needs_bash
+def test_a_dry_run_shows_every_command_and_runs_none(tmp_path: Path) -> None:
+    said = hosts_up(tmp_path, DRY="1")
+    assert said.count("ssh ") == 6
+    assert not (tmp_path / "calls").exists()
+
+
+def hosts_up(folder: Path, **more: str) -> str:
+    """Runs `hosts.sh up`, each host a home folder here; returns what it says."""
+    run = f'mkdir -p {folder}/home-$3; case "$5" in umask*) HOME={folder}/home-$3 exec bash -c "$5";; esac'
+    _fake(folder, "ssh", f'echo "$@" >> {folder}/calls; {run}')
+    environment = os.environ | {"PATH": f"{folder}:{os.environ['PATH']}", "HEAD": "a", "WORKERS": "b c"} | more
+    command = [BASH, str(LAUNCH / "hosts.sh"), "up"]
+    return subprocess.run(command, env=environment, check=True, timeout=30, capture_output=True, text=True).stdout
 
 
 @needs_bash

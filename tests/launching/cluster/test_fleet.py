@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import errno
+import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import pytest
 
 from apex_bat.config import Config, load
-from apex_bat.launching.cluster import fleet as module
-from apex_bat.launching.cluster.fleet import Fleet, LostError
+from apex_bat.launching.cluster import places as module
+from apex_bat.launching.cluster.fleet import Fleet
 from apex_bat.launching.cluster.keeper import Look, Site
+from apex_bat.launching.cluster.kept import MOST_FAILED_STARTS, LostError
 from apex_bat.launching.cluster.lease import MARGIN_S, Hearing
 from apex_bat.launching.cluster.placed import Placed
 from apex_bat.launching.supervisor import USELESS
 from apex_bat.roles.orders import Orders
-from apex_bat.roles.plan import Role
+from apex_bat.roles.plan import Role, read_addresses
+from apex_bat.roles.process import ADDRESSES
 from apex_bat.transport.reports import ReportCollector
 from apex_bat.transport.security import new_keys
 
@@ -47,6 +52,10 @@ class Host:
         self.has_place = True
         self.is_lost = self.is_silent = self.is_dismissed = False
         self.problem = ""
+        self.pids_differ = True
+        self.error: Exception | None = None
+        self.failing = ""
+        """The method that is answered by `error`, while there is one."""
         self.starts: list[Orders] = []
         self.news: list[Orders] = []
         self.ended = False
@@ -68,13 +77,16 @@ class Host:
             self._life = life
             self.starts.append(_orders(orders))
             self.ended = False
-            return 1000 + len(self.starts)
+            return self._pid()
         if method == "look":
             self._looks += 1
             if given[1] is not None:
                 self.news.append(_orders(given[1]))
-            return Look(self._looks, self._life or -1, 1000 + len(self.starts), self.ended, 4, "it ended")
+            return Look(self._looks, self._life or -1, self._pid(), self.ended, 4, "it ended")
         return None
+
+    def _pid(self) -> int:
+        return 1000 * (self.number if self.pids_differ else 1) + len(self.starts)
 
 
 def _orders(line: object) -> Orders:
@@ -109,6 +121,8 @@ class Stage:
             host, method, given = ticket
             if host.is_lost:
                 yield ticket, LostError("the node died")
+            elif host.error is not None and method == host.failing:
+                yield ticket, host.error
             elif host.has_place and not host.is_silent:
                 yield ticket, host.answer(method, given)
 
@@ -119,9 +133,9 @@ def stage() -> Stage:
 
 
 @pytest.fixture
-def fleet(stage: Stage) -> Iterator[Fleet]:
+def fleet(stage: Stage, tmp_path: Path) -> Iterator[Fleet]:
     collector = ReportCollector("tcp://127.0.0.1:0", keys=new_keys())
-    with Fleet(CONFIG, collector, new_keys(), stage) as one:
+    with Fleet(CONFIG, tmp_path, collector, new_keys(), stage) as one:
         yield one
     collector.close()
 
@@ -139,6 +153,7 @@ def test_roles_wait_for_places_and_are_told_where_the_servers_are(fleet: Fleet, 
 
     stage.prepare = without_place
     placed = [fleet.start(role, 3, 50) for role in (REPLAY, LEARNER, ACTOR)]
+    until(lambda: len(stage.hosts) == 3)
     replay, learner, actor = stage.hosts
     until(lambda: "places of replay and learner" in placed[2].waiting)
     assert placed[0].waiting == "waiting for a place in the cluster: asks 1 CPU for replay"
@@ -259,6 +274,194 @@ def test_actors_leave_their_places_to_a_learner_that_finds_none(
     until(lambda: waits.pid)
 
 
+def test_news_that_a_look_could_not_carry_goes_again(fleet: Fleet, stage: Stage) -> None:
+    first = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER, ACTOR)]
+    until(lambda: all(each.pid for each in first))
+    replay, _, actor = stage.hosts
+    replay.ended = True
+    until(first[0].poll)
+    actor.answer = _lost_news(actor)  # type: ignore[method-assign]
+    fleet.start(REPLAY, 1, 0)
+    until(lambda: actor.news)
+    assert actor.news[-1].addresses.replay == "tcp://10.0.0.1:5101"
+
+
+def _lost_news(host: Host) -> Callable[[str, tuple[object, ...]], object]:
+    """Returns answers of a host that the first news does not reach."""
+    lost = []
+    original = host.answer
+
+    def answer(method: str, given: tuple[object, ...]) -> object:
+        if method == "look" and given[1] is not None and not lost:
+            lost.append(given)
+            return OSError("its host does not answer")
+        return original(method, given)
+
+    return answer
+
+
+@pytest.mark.parametrize("method", ["site", "start"])
+def test_a_keeper_that_cannot_start_its_role_three_times_is_dismissed(method: str, fleet: Fleet, stage: Stage) -> None:
+    def full(host: Host) -> None:
+        if host.number == 1:
+            host.failing, host.error = method, OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    stage.prepare = full
+    for attempt in range(MOST_FAILED_STARTS):
+        placed, learner = fleet.start(REPLAY, attempt, 0), fleet.start(LEARNER, attempt, 0)
+        until(placed.poll)
+        ended = placed.poll()
+        assert ended is not None
+        assert ended.code is None, "it may pass by itself"
+        assert "Cannot allocate memory" in ended.detail
+        assert learner.poll() is None
+    assert stage.hosts[0].is_dismissed
+    again = fleet.start(REPLAY, MOST_FAILED_STARTS, 0)
+    until(lambda: again.pid)
+    assert len([host for host in stage.hosts if host.role is REPLAY]) == 2
+
+
+def test_an_error_that_stays_counts_as_a_failure_of_the_role() -> None:
+    for error, code in (
+        (OSError(errno.EACCES, "Permission denied"), 1), (OSError("no answer"), None), (RuntimeError("no"), 1),
+    ):  # fmt: skip
+        placed = Placed(ACTOR, 1, "1 CPU", CONFIG, Hearing(20.0), lambda _: None)
+        placed.take_error(error)
+        ended = placed.poll()
+        assert ended is not None
+        assert ended.code == code
+
+
+def test_a_place_of_a_further_actor_that_cannot_be_used_stays_empty(fleet: Fleet, stage: Stage) -> None:
+    placed = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER, ACTOR)]
+    until(lambda: all(each.pid for each in placed))
+
+    def foreign(host: Host) -> None:
+        host.problem = "not the launcher's run folder"
+
+    stage.prepare = foreign
+    late = fleet.start(Role("actor", 1), 0, 0)
+    until(lambda: "not started on host4: not the launcher's run folder" in late.waiting)
+    until(lambda: not fleet.is_waiting)
+    until(lambda: stage.hosts[3]._looks > 1)
+    assert late.poll() is None
+    assert not stage.hosts[3].starts
+    assert not stage.hosts[3].is_dismissed, "or Ray would find the same place again"
+
+
+def test_the_first_actor_keeps_its_place_which_nobody_else_could_have(
+    fleet: Fleet, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "ROOM_PERIOD_S", 0.05)
+    placed = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER, ACTOR)]
+    until(lambda: all(each.pid for each in placed))
+    asked: list[bool] = []
+
+    def short() -> bool:
+        asked.append(True)
+        return True
+
+    def without_place(host: Host) -> None:
+        host.has_place = False
+
+    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
+    stage.prepare, stage.is_short = without_place, short  # type: ignore[method-assign]
+    fleet.start(Role("evaluator", 0), 0, 0)
+    until(lambda: len(asked) > 3)
+    assert placed[2].poll() is None
+    assert not stage.hosts[2].is_dismissed
+
+
+def test_a_slow_head_of_the_cluster_holds_up_no_look(
+    fleet: Fleet, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, answered = threading.Event(), threading.Event()
+
+    def slow() -> bool:
+        asked.set()
+        answered.wait(20.0)
+        return False
+
+    stage.is_short = slow  # type: ignore[method-assign]
+    placed = [fleet.start(role, 0, 0) for role in (REPLAY, ACTOR)]
+    until(lambda: len(stage.hosts) == 2 and stage.hosts[0]._looks)
+
+    def without_place(host: Host) -> None:
+        host.has_place = False
+
+    stage.prepare = without_place
+    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
+    fleet.start(LEARNER, 0, 0)
+    assert asked.wait(20.0)
+    looks = stage.hosts[0]._looks
+    until(lambda: stage.hosts[0]._looks > looks + 2)
+    assert fleet.is_waiting, "and nobody waits for the lock"
+    assert placed[0].poll() is None
+    answered.set()
+
+
+def test_the_cluster_is_not_asked_at_every_look_whether_it_is_short(
+    fleet: Fleet, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
+    asked_s: list[float] = []
+
+    def note() -> bool:
+        asked_s.append(time.monotonic())
+        return False
+
+    def without_place(host: Host) -> None:
+        host.has_place = False
+
+    stage.prepare, stage.is_short = without_place, note  # type: ignore[method-assign]
+    fleet.start(LEARNER, 0, 0)
+    until(lambda: len(asked_s) == 2)
+    assert asked_s[1] - asked_s[0] > 0.9 * module.ROOM_PERIOD_S
+
+
+@pytest.mark.parametrize("pids_differ", [True, False])
+def test_what_a_former_life_was_writing_is_removed_before_the_next_begins_unless_a_pid_is_shared(
+    pids_differ: bool, fleet: Fleet, stage: Stage, tmp_path: Path
+) -> None:
+    def containers(host: Host) -> None:
+        host.pids_differ = pids_differ
+
+    stage.prepare = containers
+    first = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER)]
+    until(lambda: all(each.pid for each in first))
+    left = tmp_path / "checkpoints" / f".step-1.npz.{first[1].pid}.part"
+    left.parent.mkdir()
+    left.touch()
+    stage.hosts[1].ended = True
+    until(first[1].poll)
+    fleet.start(LEARNER, 1, 0)
+    assert left.exists() != pids_differ
+
+
+def test_addresses_are_written_for_those_with_keys_and_follow_the_servers(stage: Stage, tmp_path: Path) -> None:
+    for keys in ("/some/keys", ""):
+        run = tmp_path / ("with" if keys else "without")
+        run.mkdir()
+        config = msgspec.structs.replace(CONFIG, transport=msgspec.structs.replace(CONFIG.transport, keys=keys))
+        collector = ReportCollector("tcp://127.0.0.1:0", keys=new_keys())
+        with Fleet(config, run, collector, new_keys(), stage) as fleet:
+            placed = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER)]
+            until(lambda placed=placed: all(each.pid for each in placed))
+            host = next(host for host in reversed(stage.hosts) if host.role is REPLAY)
+            if keys:
+                until((run / ADDRESSES).exists)
+                assert (run / ADDRESSES).stat().st_mode & 0o777 == 0o600
+                before = read_addresses(run / ADDRESSES)
+                host.ended = True
+                until(placed[0].poll)
+                fleet.start(REPLAY, 1, 0)
+                until(lambda before=before, run=run: read_addresses(run / ADDRESSES).replay != before.replay)
+                assert before.replay == "tcp://10.0.0.1:5100"
+                assert read_addresses(run / ADDRESSES).replay == "tcp://10.0.0.1:5101"
+        assert (run / ADDRESSES).exists() == bool(keys)
+        collector.close()
+
+
 class Clock:
     """Shows what the test says."""
 
@@ -282,13 +485,51 @@ def test_a_writer_whose_keeper_died_has_the_grace_to_write_its_last_files() -> N
     for role, wait_s in ((LEARNER, CONFIG.launch.grace_s + MARGIN_S), (REPLAY, 1.0 + MARGIN_S), (ACTOR, 0.0)):
         clock = Clock()
         placed, _ = placed_on(role, clock)
+        clock.now_s = lost_s = 15.0  # heard last at 0
         placed.take_loss("it died")
-        clock.now_s = wait_s - 1e-3
+        clock.now_s = lost_s + wait_s - 1e-3
         assert (placed.poll() is None) == (wait_s > 0.0)
-        clock.now_s = wait_s
+        clock.now_s = lost_s + wait_s
         ended = placed.poll()
         assert ended is not None
         assert ended.is_lost
+
+
+def test_a_lost_keeper_enforces_no_lease() -> None:
+    clock, config = Clock(), load(None, ["cluster.lease_s=2.0", "launch.grace_s=30.0"])
+    placed, _ = placed_on(LEARNER, clock, config)
+    clock.now_s = 1.0
+    placed.take_loss("it died")
+    clock.now_s = 1.0 + 30.0
+    assert placed.poll() is None, "the lease of 2 s, or of the 20 s that were heard, says nothing"
+    clock.now_s += MARGIN_S
+    assert placed.poll() is not None
+
+
+def test_a_life_that_has_not_begun_waits_for_what_the_former_one_may_have_left_on_the_same_keeper() -> None:
+    clock, hearing = Clock(), Hearing(20.0)
+    former = Placed(LEARNER, 1, "1 CPU", CONFIG, hearing, lambda _: None, clock)
+    former.begin()
+    former.take_error(OSError("its host does not answer"))  # the order may have come through
+    hearing.take(0.0, 1)
+    placed = Placed(LEARNER, 2, "1 CPU", CONFIG, hearing, lambda _: None, clock)
+    placed.take_loss("it died")
+    assert placed.poll() is None
+    clock.now_s = CONFIG.launch.grace_s + MARGIN_S
+    assert placed.poll() is not None
+
+
+def test_a_keeper_that_was_lost_between_two_lives_is_replaced_after_the_grace(fleet: Fleet, stage: Stage) -> None:
+    first = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER)]
+    until(lambda: all(each.pid for each in first))
+    stage.hosts[0].ended = True
+    until(first[0].poll)
+    stage.hosts[0].is_lost = True
+    until(lambda: fleet._kept["replay"].is_lost)
+    lost_s = time.monotonic()
+    fleet.start(REPLAY, 1, 0)
+    until(lambda: len(stage.hosts) == 3)
+    assert time.monotonic() - lost_s > CONFIG.launch.grace_s - 0.5
 
 
 def test_a_role_without_a_place_ends_when_it_is_asked_to() -> None:
@@ -305,7 +546,7 @@ def test_a_role_without_a_place_ends_when_it_is_asked_to() -> None:
 
 def test_a_keeper_that_never_worked_counts_as_a_failure_of_the_role() -> None:
     placed = Placed(ACTOR, 1, "1 CPU", CONFIG, Hearing(20.0), lambda _: None)
-    placed.take_loss("cannot import apex_bat")
+    placed.take_loss("cannot import")
     ended = placed.poll()
     assert ended is not None
     assert (ended.code, ended.is_lost) == (1, False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ import pytest
 
 import apex_bat
 from apex_bat.launching.cluster import keeper as module
-from apex_bat.launching.cluster.keeper import MARK, Keeper, free_port, versions_here
+from apex_bat.launching.cluster.keeper import MARK, NUM_PORTS, Keeper, first_port, free_port, versions_here
 from apex_bat.launching.supervisor import Exit
 from apex_bat.roles.plan import Role
 
@@ -29,7 +30,7 @@ class Process:
         self, role: Role, run: Path, incarnation: int, num_threads: int, flown_steps: int, **more: Any
     ) -> None:
         self.given = (role, run, incarnation, num_threads, flown_steps)
-        self.told, self.folder = [more["orders"]], more["folder"]
+        self.told, self.folder, self.cleans = [more["orders"]], more["folder"], more["cleans"]
         self.ended: Exit | None = None
         self.is_killed = threading.Event()
         self.pid = 100 + len(self.made)
@@ -93,6 +94,7 @@ def test_a_role_is_started_told_and_looked_at(make: Make, tmp_path: Path) -> Non
     (process,) = Process.made
     assert process.given == (ACTOR, tmp_path, 7, 1, 500)
     assert process.folder == tmp_path
+    assert not process.cleans, "a keeper that is late would remove what the next life writes"
     look = keeper.look(0, b"news\n")
     assert process.told == [b"first\n", b"news\n"]
     assert (look.life, look.pid, look.has_ended) == (1, 100, False)
@@ -135,22 +137,62 @@ def test_looks_keep_the_role_alive(make: Make, clock: Clock) -> None:
 
 
 def test_a_folder_that_is_not_the_launchers_is_refused(make: Make, tmp_path: Path) -> None:
-    assert make().site(versions_here()).problem == ""
-    assert "another folder" in make(mark="other").site(versions_here()).problem
+    assert make().site(versions_here(), ACTOR).problem == ""
+    assert "another folder" in make(mark="other").site(versions_here(), ACTOR).problem
     (tmp_path / MARK).unlink()
-    problem = make().site(versions_here()).problem
+    problem = make().site(versions_here(), ACTOR).problem
     assert "No such file" in problem
     assert "give --run a folder that all nodes share" in problem
 
 
 def test_other_versions_are_refused(make: Make) -> None:
-    assert "versions differ" in make().site(("0.0.0", "3.11")).problem
+    assert "versions differ" in make().site(("0.0.0", "3.11"), ACTOR).problem
 
 
 def test_a_port_is_one_of_those_allowed_and_free() -> None:
     port = free_port("127.0.0.1")
     assert port > 0
     assert free_port("127.0.0.1", port) in range(port, port + 100)
+
+
+def test_servers_that_look_for_a_port_on_one_host_at_the_same_time_find_different_ones(make: Make) -> None:
+    servers = [Role("learner", 0), *(Role("replay", number, 4) for number in range(4))]
+    firsts = {first_port(role) for role in servers}
+    assert len(firsts - {0}) == len(servers), "0 is the launcher's"
+    base_port = free_port("127.0.0.1", 20_000)
+    found = [free_port("127.0.0.1", base_port, first_port(role)) for role in servers]
+    assert len(set(found)) == len(servers), "although none of them is bound yet"
+    assert all(port in range(base_port, base_port + NUM_PORTS) for port in found)
+    keeper = make()
+    assert keeper.site(versions_here(), servers[0]).port > 0
+    assert keeper.site(versions_here(), ACTOR).port == 0, "an actor listens nowhere"
+
+
+def test_after_the_last_port_comes_the_first() -> None:
+    with socket.socket() as one:
+        base_port = free_port("127.0.0.1", 20_000)
+        found = free_port("127.0.0.1", base_port, NUM_PORTS - 1)
+        one.bind(("127.0.0.1", found))
+        again = free_port("127.0.0.1", base_port, found - base_port)
+        assert again != found
+        assert again in range(base_port, base_port + NUM_PORTS)
+
+
+def test_the_watch_over_the_lease_survives_an_error(make: Make, clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    keeper = make()
+    start(keeper)
+    (process,), failed = Process.made, threading.Event()
+
+    def broken() -> None:
+        failed.set()
+        raise RuntimeError("of any kind")
+
+    process.poll = broken  # type: ignore[method-assign,assignment]
+    clock.now_s = 10.0
+    assert failed.wait(10.0)
+    del process.poll
+    assert process.is_killed.wait(10.0)
+    assert "of any kind" in caplog.text
 
 
 def test_a_role_finds_this_package_wherever_it_came_from(

@@ -1,8 +1,11 @@
 """The lease: the role has ended before its replacement begins, whatever the network does with the looks."""
 
 import random
+import time
 
-from apex_bat.launching.cluster.lease import MARGIN_S, Hearing, Lease
+import pytest
+
+from apex_bat.launching.cluster.lease import MARGIN_S, Hearing, Lease, clock_s
 
 
 class Clock:
@@ -88,3 +91,19 @@ def test_the_launcher_waits_a_moment_beyond_the_lease() -> None:
     hearing.take(100.0, 1)
     assert not hearing.is_over(105.0)
     assert hearing.is_over(105.0 + MARGIN_S)
+
+
+def test_nothing_runs_on_a_lost_keeper_after_the_grace_of_what_was_started_there() -> None:
+    hearing = Hearing(5.0)
+    assert hearing.gone_s(8.0) == float("inf")
+    hearing.take_loss(100.0)
+    hearing.take_loss(200.0)
+    assert hearing.gone_s(8.0) == 100.0, "nothing was started"
+    hearing.may_run = True
+    assert hearing.gone_s(8.0) == 108.0 + MARGIN_S
+
+
+@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no such clock")
+def test_the_lease_goes_on_while_the_machine_sleeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time, "clock_gettime", {time.CLOCK_BOOTTIME: 7.0}.__getitem__)
+    assert clock_s() == 7.0

@@ -12,6 +12,7 @@ from apex_bat.launching.cluster.placement import (
     demand_of,
     num_places,
     num_places_beside,
+    reserved_roles,
     shortage,
 )
 from apex_bat.roles.plan import Role
@@ -59,6 +60,7 @@ def test_every_role_asks_for_something_or_ray_would_put_it_anywhere() -> None:
 
 def test_actors_may_come_and_go_and_the_others_may_not() -> None:
     assert core_roles(Config()) == [REPLAY, LEARNER, EVALUATOR]
+    assert reserved_roles(Config()) == [REPLAY, LEARNER, EVALUATOR, ACTOR], "without one actor nothing would begin"
 
 
 def test_room_is_counted_node_by_node() -> None:

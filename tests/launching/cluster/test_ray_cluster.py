@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import json
 import logging
+import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -15,8 +19,11 @@ from apex_bat.cli.checking import check
 from apex_bat.config import Config, ConfigError, load
 from apex_bat.config.settings import MOST_ACTORS
 from apex_bat.launching.cluster import ray_cluster as module
+from apex_bat.launching.cluster import ray_keepers
 from apex_bat.launching.cluster.placement import ClusterError, Resources
 from apex_bat.launching.cluster.ray_cluster import connected, num_actor_places
+from apex_bat.launching.cluster.ray_keepers import RayPlacer
+from apex_bat.roles.plan import Role
 
 
 @dataclass
@@ -81,6 +88,62 @@ def test_the_learner_gets_a_gpu_of_a_cluster_that_has_one(ray: Ray) -> None:
     assert not module._has_gpu(module._nodes())
     ray.nodes.append({"CPU": 1.0, "GPU": 1.0})
     assert module._has_gpu(module._nodes())
+
+
+def test_what_roles_ask_stays_what_their_places_hold_when_nodes_come_and_go(
+    ray: Ray, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked: list[list[Resources]] = []
+    monkeypatch.setattr(module, "placement_group", lambda bundles, **_: asked.append(bundles))
+    monkeypatch.setattr(module, "_await_places", lambda *_: None)
+    config = Config()
+    with module._places(config) as (group, demands):
+        assert list(demands) == ["replay", "learner", "evaluator", "actor-0"], "without an actor nothing would begin"
+        assert asked == [list(demands.values())]
+        placer = RayPlacer(config, tmp_path, "m", group, demands)
+        before = placer.asks(Role("learner", 0))
+        ray.nodes.append({"CPU": 1.0, "GPU": 1.0})
+        assert placer.asks(Role("learner", 0)) == before == "1 CPU"
+        assert placer.asks(Role("actor", 0)) == placer.asks(Role("actor", 9)) == "1 CPU"
+
+
+@pytest.mark.parametrize(("status", "waits"), [(None, False), ({"ended": True}, False), ({"ended": False}, True)])
+def test_what_a_former_launcher_may_have_left_running_is_waited_for(
+    status: dict[str, bool] | None, waits: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slept_s: list[float] = []
+    monkeypatch.setattr(time, "sleep", slept_s.append)
+    if status is not None:
+        facts = {"launcher_pid": 1, "host": "elsewhere", "written_unix_s": 0.0, "roles": []}
+        (tmp_path / "status.json").write_text(json.dumps(facts | status))
+    for lease_s, wait_s in ((20.0, 20.5), (2.0, 8.5)):
+        module._await_leases(load(None, [f"cluster.lease_s={lease_s}", "launch.grace_s=8.0"]), tmp_path)
+        assert slept_s == ([wait_s] if waits else [])
+        slept_s.clear()
+
+
+def test_a_damaged_status_does_not_say_that_the_run_has_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    slept_s: list[float] = []
+    monkeypatch.setattr(time, "sleep", slept_s.append)
+    (tmp_path / "status.json").write_text("{")
+    module._await_leases(Config(), tmp_path)
+    assert slept_s
+
+
+def test_the_number_of_an_error_of_a_keeper_comes_along() -> None:
+    from ray.exceptions import RayTaskError
+
+    def raised(cause: Exception) -> Exception:
+        return ray_keepers._raised(RayTaskError("start", f"traceback\n{type(cause).__name__}: {cause}", cause))
+
+    denied = raised(PermissionError(errno.EACCES, "Permission denied"))
+    assert isinstance(denied, OSError)
+    assert denied.errno == errno.EACCES
+    assert "Permission denied" in str(denied)
+    none_free = raised(OSError("none of the ports is free"))
+    assert isinstance(none_free, OSError)
+    assert none_free.errno is None
+    assert not isinstance(raised(ValueError("x")), OSError)
 
 
 class NoPlace:

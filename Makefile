@@ -17,7 +17,7 @@ train: setup
 	$(BIN)/apex-bat train --config configs/memory.toml
 
 test: setup
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2
 
 test-slow: setup
 	$(BIN)/pytest -m slow --timeout 900

@@ -280,7 +280,7 @@ def test_news_that_a_look_could_not_carry_goes_again(fleet: Fleet, stage: Stage)
     replay, _, actor = stage.hosts
     replay.ended = True
     until(first[0].poll)
-    actor.answer = _lost_news(actor)  # type: ignore[method-assign]
+    actor.answer = _lost_news(actor)  # type: ignore[method-assign,assignment]
     fleet.start(REPLAY, 1, 0)
     until(lambda: actor.news)
     assert actor.news[-1].addresses.replay == "tcp://10.0.0.1:5101"
@@ -288,7 +288,7 @@ def test_news_that_a_look_could_not_carry_goes_again(fleet: Fleet, stage: Stage)
 
 def _lost_news(host: Host) -> Callable[[str, tuple[object, ...]], object]:
     """Returns answers of a host that the first news does not reach."""
-    lost = []
+    lost: list[object] = []
     original = host.answer
 
     def answer(method: str, given: tuple[object, ...]) -> object:
@@ -446,7 +446,7 @@ def test_addresses_are_written_for_those_with_keys_and_follow_the_servers(stage:
         collector = ReportCollector("tcp://127.0.0.1:0", keys=new_keys())
         with Fleet(config, run, collector, new_keys(), stage) as fleet:
             placed = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER)]
-            until(lambda placed=placed: all(each.pid for each in placed))
+            until(lambda placed=placed: all(each.pid for each in placed))  # type: ignore[misc]
             host = next(host for host in reversed(stage.hosts) if host.role is REPLAY)
             if keys:
                 until((run / ADDRESSES).exists)
@@ -455,7 +455,7 @@ def test_addresses_are_written_for_those_with_keys_and_follow_the_servers(stage:
                 host.ended = True
                 until(placed[0].poll)
                 fleet.start(REPLAY, 1, 0)
-                until(lambda before=before, run=run: read_addresses(run / ADDRESSES).replay != before.replay)
+                until(lambda before=before, run=run: read_addresses(run / ADDRESSES).replay != before.replay)  # type: ignore[misc]
                 assert before.replay == "tcp://10.0.0.1:5100"
                 assert read_addresses(run / ADDRESSES).replay == "tcp://10.0.0.1:5101"
         assert (run / ADDRESSES).exists() == bool(keys)

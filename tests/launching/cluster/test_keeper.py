@@ -187,7 +187,7 @@ def test_the_watch_over_the_lease_survives_an_error(make: Make, clock: Clock, ca
         failed.set()
         raise RuntimeError("of any kind")
 
-    process.poll = broken  # type: ignore[method-assign,assignment]
+    process.poll = broken  # type: ignore[method-assign]
     clock.now_s = 10.0
     assert failed.wait(10.0)
     del process.poll

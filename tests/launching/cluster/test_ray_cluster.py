@@ -134,7 +134,8 @@ def test_the_number_of_an_error_of_a_keeper_comes_along() -> None:
     from ray.exceptions import RayTaskError
 
     def raised(cause: Exception) -> Exception:
-        return ray_keepers._raised(RayTaskError("start", f"traceback\n{type(cause).__name__}: {cause}", cause))
+        text = f"traceback\n{type(cause).__name__}: {cause}"
+        return ray_keepers._raised(RayTaskError("start", text, cause))  # type: ignore[no-untyped-call]
 
     denied = raised(PermissionError(errno.EACCES, "Permission denied"))
     assert isinstance(denied, OSError)

@@ -22,6 +22,7 @@ from apex_bat.recording.blueprints import APPLICATION_ID, flight_blueprint
 from apex_bat.recording.columns import tensor_columns
 from apex_bat.recording.flight import ACTION_NAMES, Flight
 from apex_bat.recording.hearing import Directions
+from apex_bat.recording.orphans import drop_orphans, save
 from apex_bat.recording.series import ACTION_COLOURS, SERIES, SETTINGS_PATH
 from apex_bat.simulation.layout import Arena
 from apex_bat.simulation.sonar import Sonar
@@ -51,18 +52,24 @@ def write_flight(flight: Flight, arena: Arena, sonar: settings.Sonar, directions
             " directions; give those of its own range sensor"
         )
     part = path.with_name(path.name + ".part")
-    recording = rr.RecordingStream(APPLICATION_ID, recording_id=uuid.uuid4())
     try:
-        recording.save(part, default_blueprint=flight_blueprint(arena))
-        _send_all(recording, flight, arena, sonar, directions)
-        recording.flush()
-        recording.disconnect()
+        _write(flight, arena, sonar, directions, part)
         part.replace(path)
     except RuntimeError as error:  # rerun's, for a full disk or a missing folder
         raise OSError(f"{path}: the recording cannot be written: {error}") from error
     finally:
-        recording.disconnect()
+        drop_orphans()
         part.unlink(missing_ok=True)
+
+
+def _write(flight: Flight, arena: Arena, sonar: settings.Sonar, directions: Directions, path: Path) -> None:
+    recording = rr.RecordingStream(APPLICATION_ID, recording_id=uuid.uuid4())
+    try:
+        save(recording, path, flight_blueprint(arena), APPLICATION_ID)
+        _send_all(recording, flight, arena, sonar, directions)
+        recording.flush()
+    finally:
+        recording.disconnect()
 
 
 def _send_all(

@@ -26,6 +26,7 @@ from rerun.chunk import RrdReader
 from apex_bat import config as configuration
 from apex_bat.recording.blueprints import APPLICATION_ID, flight_blueprint, training_blueprint
 from apex_bat.recording.curves import TRAINING_APPLICATION_ID, TrainingCurves
+from apex_bat.recording.orphans import drop_orphans
 from apex_bat.recording.reading import RecordingError, is_whole, read_settings
 from apex_bat.recording.training import row_of
 from apex_bat.storage import StorageError, read_json
@@ -155,17 +156,21 @@ class RunStream:
         if newest is None or newest == self._sent:
             return
         try:
-            arena = read_settings(newest).arena
-            reader = RrdReader(newest)
-            flight = rr.RecordingStream(APPLICATION_ID, recording_id=reader.recordings()[0].recording_id)
-            flight.connect_grpc(self._url, default_blueprint=flight_blueprint(arena, is_playing=True))
-            flight.send_chunks(reader.stream())
+            self._send(newest)
         except (RecordingError, OSError) as error:  # deleted meanwhile, for want of room
             _log.warning("not sent: %s", error)
             return
+        drop_orphans()
+        self._sent = newest
+
+    def _send(self, path: Path) -> None:
+        arena = read_settings(path).arena
+        reader = RrdReader(path)
+        flight = rr.RecordingStream(APPLICATION_ID, recording_id=reader.recordings()[0].recording_id)
+        flight.connect_grpc(self._url, default_blueprint=flight_blueprint(arena, is_playing=True))
+        flight.send_chunks(reader.stream())
         flight.flush(timeout_sec=STEP_TIMEOUT_S)
         flight.disconnect()
-        self._sent = newest
 
     def _forget(self) -> None:
         if self._training is not None:

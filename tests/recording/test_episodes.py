@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from rerun.chunk import RrdReader
 
@@ -204,6 +205,16 @@ def test_missing_folder_is_an_os_error_that_names_the_file(
 ) -> None:
     with pytest.raises(OSError, match=r"x\.rrd"):
         write_flight(fly(2), room, settings.Sonar(), directions, tmp_path / "nowhere" / "x.rrd")
+
+
+def test_a_recording_leaves_no_thread_behind(
+    fly: Callable[..., Flight], room: Arena, directions: Directions, tmp_path: Path
+) -> None:
+    process, threads = psutil.Process(), []
+    for number in range(6):
+        write_flight(fly(2), room, settings.Sonar(), directions, tmp_path / f"{number}.rrd")
+        threads.append(process.num_threads())
+    assert threads[-1] <= threads[0], threads
 
 
 def _entity(path: Path, entity: str, component: str) -> tuple[list[int], list[Any]]:

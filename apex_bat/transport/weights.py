@@ -31,6 +31,8 @@ REPEAT_S = 2.0  # silence after which the newest weights are sent again
 LEAST_REPEAT_S = 0.1  # between two broadcasts for late subscribers: who subscribes all the time must not load the rest
 AT_ONCE = 100  # notices looked at by one call
 MAX_NOTICE_BYTES = 1024  # of what a subscriber sends: handshakes have 200 to 400, a subscription 1
+HEARTBEAT_MS = 1000
+HEARTBEAT_TIMEOUT_MS = 3000  # silence after which a subscriber counts as gone
 MAX_STRANGE = 256  # subscriptions to something else until the socket is opened anew; each may hold 1 KB, 40 in libzmq
 
 
@@ -106,7 +108,13 @@ class WeightsPublisher:
         self._listener.close()
 
     def _open(self, address: str) -> Listener:
-        options: dict[int, int] = {zmq.XPUB_VERBOSE: 1}  # every subscription is told, not only the first
+        options: dict[int, int] = {
+            zmq.XPUB_VERBOSE: 1,  # every subscription is told, not only the first
+            # Without them strangers that stay half-way could hold this socket in libzmq for 30 s (seen). A subscriber's
+            # queue is of one message and never full, so that libzmq's fault, told in `sockets`, cannot meet it.
+            zmq.HEARTBEAT_IVL: HEARTBEAT_MS,
+            zmq.HEARTBEAT_TIMEOUT: HEARTBEAT_TIMEOUT_MS,
+        }
         return Listener(
             zmq.XPUB,
             address,

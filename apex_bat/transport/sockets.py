@@ -6,8 +6,8 @@ Queues, kernel buffers and message sizes are bounded, the kernel notices dead pe
 themselves are closed, and nothing lingers when a socket is closed.
 
 ZeroMQ's own heartbeats stay off, but at the publisher of weights: with them libzmq 4.3.5 aborts the process when a peer
-dies whose messages have filled the queue (its issues 3937, 4364 and 4767, open). TCP's keepalive and user timeout notice
-a pulled cable as well, and a Unix socket has none to pull.
+dies whose messages have filled the queue (its issues 3937, 4364 and 4767, open). TCP's keepalive and user timeout
+notice a pulled cable as well, and a Unix socket has none to pull.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ import numpy as np
 import zmq
 
 from apex_bat.transport.framing import MAGIC, PREFIX, PROTOCOL
-from apex_bat.transport.messages import Insert, PriorityUpdate, Report, SampleRequest, Weights, encode
+from apex_bat.transport.messages import Insert, PriorityUpdate, Report, SampleRequest, Subscription, Weights, encode
 from benchmarks.replay import synthetic_chunk
 
 MAX_OPEN = 400  # connections that one attacker holds open; the oldest is let go
@@ -63,7 +63,7 @@ def random_bytes(target: Target) -> Shot:
 
 def claimed_size(target: Target) -> Shot:
     """Introduces itself rightly, announces a message of a terabyte and leaves."""
-    names = {zmq.DEALER: b"DEALER", zmq.PUSH: b"PUSH", zmq.SUB: b"SUB"}
+    names = {zmq.DEALER: b"DEALER", zmq.PUSH: b"PUSH"}
     kind = names[zmq.SocketType(target.kind)]
     ready = b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind
 
@@ -72,20 +72,6 @@ def claimed_size(target: Target) -> Shot:
             connection.sendall(GREETING + b"\x04" + bytes([len(ready)]) + ready)
             connection.recv(64)
             connection.sendall(b"\x02" + (1 << 40).to_bytes(8, "big") + bytes(64))
-
-    return shoot
-
-
-def subscriptions(target: Target) -> Shot:
-    """Subscribes to one more topic of 900 bytes, again and again to all, and writes to the publisher."""
-    attacker = _socket(target)
-    generator = np.random.default_rng(0)
-
-    def shoot() -> None:
-        with suppress(zmq.Again):
-            attacker.send(b"\x01" + generator.bytes(900), zmq.NOBLOCK)
-            attacker.send(b"\x01", zmq.NOBLOCK)
-            attacker.send(b"message", zmq.NOBLOCK)
 
     return shoot
 
@@ -128,6 +114,7 @@ def _lying() -> bytes:
 
 _UNKNOWN_ITEMS = PriorityUpdate(0, np.arange(512) + 2**40, np.ones(512, np.float32))
 _REPORT = encode(Report("nobody", 1, "h", "a", "s", {}))
+_SUBSCRIPTION = bytes(encode(Subscription(-1, 0)))
 _VERSION = bytearray(_insert())
 _VERSION[4:6] = b"\x09\x00"
 
@@ -166,7 +153,17 @@ ON_REPORTS = {
     "unknown role": _sending(bytes(_REPORT)),
     "wrong socket": _sending(_insert()),
 }
-ON_WEIGHTS = {**CONNECTIONS, "oversized": oversized, "subscriptions": subscriptions}
+ON_WEIGHTS = {
+    **CONNECTIONS,
+    "oversized": oversized,
+    "foreign bytes": MESSAGES["foreign bytes"],
+    "truncated": _sending(_SUBSCRIPTION[:-8]),
+    "lying shapes": MESSAGES["lying shapes"],
+    "five parts": _sending(_SUBSCRIPTION, b"", b"a", b"b", b"c"),
+    "subscriptions of a stranger": _sending(_SUBSCRIPTION, generation=0),
+    "subscriptions": _sending(_SUBSCRIPTION),
+    "wrong socket": _sending(bytes(encode(SampleRequest(1, 64, 0)))),
+}
 
 
 def _connect(target: Target) -> socket.socket:
@@ -175,8 +172,7 @@ def _connect(target: Target) -> socket.socket:
 
 
 def _socket(target: Target) -> zmq.Socket[bytes]:
-    kind = zmq.XSUB if target.kind == zmq.SUB else target.kind  # one that may send
-    attacker: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
+    attacker: zmq.Socket[bytes] = zmq.Context.instance().socket(target.kind)
     attacker.setsockopt(zmq.LINGER, 0)
     attacker.setsockopt(zmq.SNDHWM, 10)
     attacker.setsockopt(zmq.RECONNECT_IVL, 50)

@@ -27,7 +27,7 @@ from apex_bat.replay.client import ReplayReader, ReplayWriter
 from apex_bat.replay.server import ReplayServer
 from apex_bat.transport.messages import Report
 from apex_bat.transport.reports import MAX_REPORT_BYTES, ReportCollector, Reporter
-from apex_bat.transport.weights import MAX_NOTICE_BYTES, WeightsPublisher, WeightsSubscriber
+from apex_bat.transport.weights import MAX_SUBSCRIPTION_BYTES, WeightsPublisher, WeightsSubscriber
 from benchmarks.attacks import CONNECTIONS, ON_REPLAY, ON_REPORTS, ON_WEIGHTS, Shot, Target
 from benchmarks.replay import synthetic_chunk
 
@@ -141,9 +141,12 @@ def report(address: str, counts: Counts, stop: Event) -> None:
 
 SETUPS = (
     Setup("replay", serve_replay, (insert, sample), ON_REPLAY, zmq.DEALER, 2 << 20, ("inserts", "batches")),
-    Setup("weights", serve_weights, (subscribe,), ON_WEIGHTS, zmq.SUB, MAX_NOTICE_BYTES, ("broadcasts", "received")),
+    Setup(
+        "weights", serve_weights, (subscribe,), ON_WEIGHTS, zmq.DEALER, MAX_SUBSCRIPTION_BYTES,
+        ("broadcasts", "received"),
+    ),
     Setup("reports", serve_reports, (report,), ON_REPORTS, zmq.PUSH, MAX_REPORT_BYTES, ("reports",)),
-)
+)  # fmt: skip
 
 
 def rate_of(attack: str) -> int:

@@ -17,7 +17,7 @@ STRANGERS = {
     "foreign bytes",
     "unknown generation",
     "requests of a stranger",
-    "subscriptions",
+    "subscriptions of a stranger",
 }
 CASES = {(str(record["socket"]), str(record["attack"])): record for record in RECORDS}
 

@@ -48,6 +48,7 @@ def run_learner(assignment: Assignment) -> None:
             if (moved := assignment.moved()) is not None:
                 reader.redirect(moved.replays, moved.replay_generations)
             learner.step(_WAIT_S)
+            reporter.gauge("weights.subscribers", publisher.num_subscribers)
             for reason in PUBLISHER_REASONS:
                 reporter.gauge(f"weights.refused.{reason}", publisher.refusals.counts.get(reason, 0))
         learner.report("writing the last checkpoint")

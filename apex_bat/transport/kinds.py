@@ -182,6 +182,14 @@ class Weights(NamedTuple):
     arrays: dict[str, NDArray[np.float32]]
 
 
+class Subscription(Header, frozen=True, tag="subscription"):
+    """Asks for the newest weights now, unless they are these, and for all that follow while it is renewed."""
+
+    version: Annotated[int, Meta(ge=-1, le=2**62)]
+    """Of the weights that the subscriber has; -1: it has none."""
+    learner_step: Number
+
+
 class Report(Header, frozen=True, tag="report"):
     """A role tells the launcher that it lives, and how."""
 
@@ -206,6 +214,7 @@ Message = (
     | RatioChange
     | Ratio
     | Weights
+    | Subscription
     | Report
 )
 Headers = (
@@ -220,5 +229,6 @@ Headers = (
     | RatioChange
     | Ratio
     | WeightsHeader
+    | Subscription
     | Report
 )

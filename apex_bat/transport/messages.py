@@ -5,7 +5,8 @@
     learner -> replay   PartRequest       replay -> learner  Sample, Standing
     learner -> replay   PriorityUpdate
     anybody -> replay   RatioChange       replay -> anybody  Ratio
-    learner -> actors   Weights           any    -> launcher Report
+    actor   -> learner  Subscription      learner -> actors  Weights
+    any     -> launcher Report
 
 `decode` either returns a message whose sizes, shapes, types and values are right or raises `MessageError`, whatever the
 bytes. There is no pickle; see `framing` for the bytes, `kinds` for the messages and `bodies` for their arrays.
@@ -31,6 +32,7 @@ from apex_bat.transport.kinds import (
     Sample,
     SampleRequest,
     Standing,
+    Subscription,
     Waiting,
     Weights,
 )
@@ -52,6 +54,7 @@ __all__ = [
     "RatioChange",
     "Ratio",
     "Weights",
+    "Subscription",
     "Report",
 ]
 

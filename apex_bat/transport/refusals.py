@@ -20,17 +20,18 @@ REASONS: dict[str, str] = {
     "value": "values that are not finite or out of range",
     "unexpected": "a right message at the wrong socket",
     "superseded": "an actor whose place another incarnation has taken",
-    "flood": "more sample requests than may wait",
+    "flood": "more sample requests, or subscribers, than may wait",
     "batch_size": "a sample request for another batch size than the settings give",
     "chunk": "a chunk that does not fit this replay",
     "role": "a report of a role that the run does not have",
-    "subscription": "a subscription to something else than all weights",
     "key": "a client whose key is not listed",
     "handshake": "a connection that ended, or stayed silent, before it had introduced itself",
 }
 """Every reason for which a listening socket refuses something, and what it means."""
 
-PUBLISHER_REASONS = ("unexpected", "subscription", "key", "handshake")
+PUBLISHER_REASONS = (
+    "foreign", "protocol", "generation", "size", "parts", "header", "unexpected", "flood", "key", "handshake",
+)  # fmt: skip
 """Those for which a publisher of weights does."""
 
 

@@ -5,7 +5,7 @@ keys; a loopback address without them is taken with a warning, because every use
 Queues, kernel buffers and message sizes are bounded, the kernel notices dead peers, connections that do not introduce
 themselves are closed, and nothing lingers when a socket is closed.
 
-ZeroMQ's own heartbeats stay off, but at the publisher of weights: with them libzmq 4.3.5 aborts the process when a peer
+ZeroMQ's own heartbeats stay off: with them libzmq 4.3.5 aborts the process when a peer
 dies whose messages have filled the queue (its issues 3937, 4364 and 4767, open). TCP's keepalive and user timeout
 notice a pulled cable as well, and a Unix socket has none to pull.
 """

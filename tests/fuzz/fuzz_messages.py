@@ -29,6 +29,7 @@ from apex_bat.transport.messages import (
     Sample,
     SampleRequest,
     Standing,
+    Subscription,
     Waiting,
     Weights,
     decode,
@@ -72,6 +73,7 @@ SEEDS: dict[str, Message] = {
     "ratio": RatioChange(2.5),
     "ratio_now": Ratio(2.5, 800.0, "because"),
     "weights": Weights(3, 75, {"a.weight": np.ones((2, 3), np.float32), "a.bias": np.zeros((), np.float32)}),
+    "subscription": Subscription(-1, 75),
     "report": Report("actor-0", 77, "host", "ipc:///x", "flying", {"steps_per_s": 1.5}),
 }
 """A right message of each kind, small."""

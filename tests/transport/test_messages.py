@@ -25,6 +25,7 @@ from apex_bat.transport.messages import (
     Sample,
     SampleRequest,
     Standing,
+    Subscription,
     Waiting,
     Weights,
     decode,
@@ -75,6 +76,7 @@ MESSAGES: list[Message] = [
     RatioChange(2.5),
     Ratio(2.5, 800.0, "because"),
     Weights(3, 75, {"a.weight": np.ones((2, 3), np.float32), "a.bias": np.zeros((), np.float32)}),
+    Subscription(-1, 75),
     Report("actor", 77, "host", "ipc:///x", "flying", {"steps_per_s": 1.5}),
 ]
 

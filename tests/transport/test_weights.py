@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,10 +13,17 @@ import pytest
 import zmq
 from numpy.typing import NDArray
 
-from apex_bat.transport.messages import Weights
+from apex_bat.transport.messages import Subscription, Waiting, Weights, encode
 from apex_bat.transport.security import make_keys
 from apex_bat.transport.sockets import Connection
-from apex_bat.transport.weights import MAX_NOTICE_BYTES, REPEAT_S, WeightsPublisher, WeightsSubscriber
+from apex_bat.transport.weights import (
+    LAPSE_S,
+    MAX_SUBSCRIPTION_BYTES,
+    RENEW_S,
+    WeightsPublisher,
+    WeightsSubscriber,
+)
+from benchmarks.attacks import ON_WEIGHTS, Target
 
 SHAPES: dict[str, tuple[int, ...]] = {"w": (3, 4), "b": (4,)}
 
@@ -66,16 +74,16 @@ def test_a_late_subscriber_gets_the_newest_at_once(publisher: WeightsPublisher) 
 def test_a_slow_subscriber_finds_the_newest_even_if_a_full_queue_dropped_it() -> None:
     now = [0.0]
     publisher = WeightsPublisher("tcp://127.0.0.1:0", clock=lambda: now[0])
-    subscriber = WeightsSubscriber(publisher.address)
+    subscriber = WeightsSubscriber(publisher.address, clock=lambda: now[0])
     try:
         publisher.publish(0, 0, arrays(0))
         arrival(publisher, subscriber)
         for version in range(1, 100):  # faster than any queue is emptied
             publisher.publish(version, version, arrays(version))
-        now[0] = REPEAT_S
+        now[0] = RENEW_S
         seen = [arrival(publisher, subscriber).version]
         while seen[-1] < 99:
-            now[0] += REPEAT_S
+            now[0] += RENEW_S
             seen.append(arrival(publisher, subscriber).version)
         assert len(seen) < 99
         assert seen == sorted(seen)
@@ -130,18 +138,14 @@ def test_weights_of_another_network_are_refused_and_counted(
     assert arrival(publisher, subscriber).version == 2
 
 
-def test_weights_of_another_generation_are_refused(publisher: WeightsPublisher) -> None:
-    other = WeightsSubscriber(publisher.address, generation=3)
-    try:
-        publisher.publish(1, 1, arrays(1))
-        ends_s = time.monotonic() + 10
-        while other.refusals.counts != {"generation": 1}:
-            assert time.monotonic() < ends_s
-            publisher.serve()
-            other.wait(0.01)
-            other.newest()
-    finally:
-        other.close()
+def test_weights_of_another_generation_are_refused(publisher: WeightsPublisher, subscriber: WeightsSubscriber) -> None:
+    publisher.publish(1, 1, arrays(1))
+    assert arrival(publisher, subscriber).version == 1
+    publisher._generation = 3
+    publisher.publish(2, 2, arrays(2))
+    assert subscriber.wait(10.0)
+    assert subscriber.newest() is None
+    assert subscriber.refusals.counts == {"generation": 1}
 
 
 def test_arrays_in_any_memory_order_arrive_as_they_are(publisher: WeightsPublisher) -> None:
@@ -168,72 +172,135 @@ def test_weights_travel_encrypted_to_those_with_keys(tmp_path: Path) -> None:
         publisher.close()
 
 
-def test_strange_subscriptions_are_counted_and_forgotten_and_disturb_nobody(
-    publisher: WeightsPublisher, subscriber: WeightsSubscriber, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("apex_bat.transport.weights.MAX_STRANGE", 3)
-    publisher.publish(1, 1, arrays(1))
-    assert arrival(publisher, subscriber).version == 1
-    address = publisher.address
-    stranger = Connection(zmq.XSUB, address)
+def until(publisher: WeightsPublisher, is_so: Callable[[], bool]) -> None:
+    """Serves the publisher until something is so."""
+    ends_s = time.monotonic() + 10
+    while not is_so():
+        assert time.monotonic() < ends_s
+        publisher.serve()
+
+
+def test_what_is_no_subscription_of_one_who_knows_the_generation_is_refused_and_counted() -> None:
+    publisher = WeightsPublisher("tcp://127.0.0.1:0", generation=7)
+    stranger = Connection(zmq.DEALER, publisher.address)
     try:
-        for topic in range(10):
-            stranger.socket.send(b"\x01topic%d" % topic)
-        stranger.socket.send(b"\x00topic")
-        ends_s = time.monotonic() + 10
-        while publisher.refusals.counts.get("subscription", 0) < 4 or "unexpected" not in publisher.refusals.counts:
-            assert time.monotonic() < ends_s
-            with suppress(zmq.Again):  # again and again: what is under way when the socket is opened anew is lost
-                stranger.socket.send(b"a message", zmq.NOBLOCK)
-            publisher.serve()
-        publisher.publish(2, 2, arrays(2))
-        assert arrival(publisher, subscriber).version == 2  # by a connection made anew, if it has to be
-        assert publisher.address == address
-        assert publisher._num_strange <= 7, "of ten; those before the socket was opened anew are forgotten"
+        publisher.publish(1, 1, arrays(1))
+        subscription = bytes(encode(Subscription(-1, 0), 7))
+        strange = [bytes(100)], [bytes(encode(Subscription(-1, 0), 8))], [subscription, b"more"]
+        for parts in (*strange, [bytes(encode(Waiting("x"), 7))]):
+            stranger.socket.send_multipart(parts)
+        until(publisher, lambda: publisher.refusals.total == 4)
+        assert publisher.refusals.counts == {"foreign": 1, "generation": 1, "parts": 1, "unexpected": 1}
+        assert publisher.num_subscribers == 0
+        assert not stranger.socket.poll(50), "and nobody of them got weights"
     finally:
         stranger.close()
+        publisher.close()
 
 
 def test_who_subscribes_all_the_time_does_not_multiply_the_broadcasts() -> None:
+    publisher = WeightsPublisher("tcp://127.0.0.1:0", clock=lambda: 0.0)
+    greedy = Connection(zmq.DEALER, publisher.address)  # one that keeps all that comes
+    try:
+        publisher.publish(1, 1, arrays(1))
+        for _ in range(50):
+            greedy.socket.send(encode(Subscription(-1, 0)))
+        greedy.socket.send(b"the last")  # counted when all before it have been seen
+        until(publisher, lambda: publisher.refusals.total == 1)
+        received = 0
+        while greedy.socket.poll(50):
+            greedy.socket.recv()
+            received += 1
+        assert received == 1
+    finally:
+        greedy.close()
+        publisher.close()
+
+
+def test_who_does_not_renew_is_forgotten_and_gets_the_newest_when_it_returns() -> None:
     now = [0.0]
     publisher = WeightsPublisher("tcp://127.0.0.1:0", clock=lambda: now[0])
-    subscriber = Connection(zmq.SUB, publisher.address)  # one that keeps all that comes
-    subscriber.socket.setsockopt(zmq.SUBSCRIBE, b"")
-    stranger = Connection(zmq.XSUB, publisher.address)
+    subscriber = WeightsSubscriber(publisher.address, clock=lambda: now[0])
     try:
-        ends_s = time.monotonic() + 10
         publisher.publish(1, 1, arrays(1))
-        while not subscriber.socket.poll(10):
-            assert time.monotonic() < ends_s
-            publisher.serve()
-        for _ in range(50):
-            stranger.socket.send(b"\x01")
-        stranger.socket.send(b"the last")  # counted when all before it have been seen
-        while not publisher.refusals.total:
-            assert time.monotonic() < ends_s
-            publisher.serve()
-        received = 0
-        while subscriber.socket.poll(50):
-            subscriber.socket.recv()
-            received += 1
-        assert received <= 2  # the clock stands: one for all who subscribed, beside the first
+        assert arrival(publisher, subscriber).version == 1
+        now[0] = LAPSE_S + 1.0
+        publisher.publish(2, 2, arrays(2))
+        assert publisher.num_subscribers == 0
+        assert arrival(publisher, subscriber).version == 2
+        assert publisher.num_subscribers == 1
     finally:
-        stranger.close()
         subscriber.close()
         publisher.close()
 
 
-def test_a_large_subscription_ends_the_connection(publisher: WeightsPublisher) -> None:
-    stranger = Connection(zmq.XSUB, publisher.address)
+def test_more_subscribers_than_are_taken_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("apex_bat.transport.weights.MAX_SUBSCRIBERS", 1)
+    publisher = WeightsPublisher("tcp://127.0.0.1:0")
+    publisher.publish(1, 1, arrays(1))
+    first, second = (WeightsSubscriber(publisher.address) for _ in range(2))
     try:
-        stranger.socket.send(b"\x01" + bytes(MAX_NOTICE_BYTES))
-        ends_s = time.monotonic() + 10
-        while not publisher._listener.num_ended:
-            assert time.monotonic() < ends_s
-            publisher.serve()
+        assert arrival(publisher, first).version == 1
+        second.wait(0.0)
+        until(publisher, lambda: publisher.refusals.counts == {"flood": 1})
+        assert second.newest() is None
+    finally:
+        first.close()
+        second.close()
+        publisher.close()
+
+
+def test_a_large_subscription_ends_the_connection(publisher: WeightsPublisher) -> None:
+    stranger = Connection(zmq.DEALER, publisher.address)
+    try:
+        stranger.socket.send(bytes(MAX_SUBSCRIPTION_BYTES + 1))
+        until(publisher, lambda: publisher._listener.num_ended > 0)
         assert publisher.refusals.total == 0
     finally:
         stranger.close()
+
+
+@pytest.mark.slow
+def test_a_publisher_goes_on_whatever_strangers_do() -> None:
+    publisher = WeightsPublisher("tcp://127.0.0.1:0", generation=7)
+    subscriber = WeightsSubscriber(publisher.address, generation=7)
+    attackers = multiprocessing.get_context("spawn").Process(target=attack, args=(publisher.address,), daemon=True)
+    attackers.start()
+    longest_s, ends_s, version = 0.0, time.monotonic() + 30, 0
+    try:
+        while time.monotonic() < ends_s:
+            begun_s = time.monotonic()
+            publisher.serve()
+            longest_s = max(longest_s, time.monotonic() - begun_s)
+            if subscriber.newest() is not None or not version:
+                version += 1
+                publisher.publish(version, version, arrays(version))
+            subscriber.wait(0.005)
+        assert publisher.refusals.total > 1000
+        assert version > 1000
+        assert longest_s < 2.0
+    finally:
+        attackers.kill()
+        attackers.join()
+        subscriber.close()
+        publisher.close()
+
+
+def attack(address: str) -> None:
+    """A process: strangers make every attack on a publisher, 100 rounds a second, and half of them come and go."""
+    while True:
+        shots = [make(Target(address, 0, MAX_SUBSCRIPTION_BYTES, zmq.DEALER)) for make in ON_WEIGHTS.values()]
+        topics: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.XSUB)
+        topics.setsockopt(zmq.LINGER, 0)
+        topics.connect(address)
+        for number in range(200):
+            for shoot in shots:
+                with suppress(OSError):
+                    shoot()
+            with suppress(zmq.Again):
+                topics.send(b"\x01" + number.to_bytes(2, "big") * 450, zmq.NOBLOCK)
+            time.sleep(0.01)
+        topics.close()
 
 
 def test_a_subscriber_follows_a_publisher_to_another_address_and_generation(

@@ -13,16 +13,14 @@ from apex_bat.config import Config
 from apex_bat.config.loading import dumps
 from benchmarks import chaos, chaos_report
 from benchmarks.chaos_report import Course, Fault, Timeline
+from tests.launching.small_run import SMALL, options
 
 ROOT = Path(__file__).parents[2]
 RESULT = ROOT / "docs" / "results" / "chaos.json"
-SMALL = (
-    "actors=2", "bats_per_actor=4", "replay.min_size=200", "replay.capacity=5_000", "replay.samples_per_insert=2.0",
-    "learner.batch_size=16", "learner.weights_period=5", "network.channels=[4]", "network.strides=[3]",
-    "network.hidden=[16]", "actor.chunk_transitions=10", "evaluation.flights=2", "evaluation.period_s=1.0",
-    "checkpoint.period_s=1.0", "replay.snapshot_period_s=2.0", "recording.evaluation_flights=1",
-    "episode.evaluation_steps=40", "launch.max_failures=100", "launch.heartbeat_timeout_s=10.0",
-)  # fmt: skip
+SETTINGS = {
+    **SMALL, "actors": "2", "replay.snapshot_period_s": "2.0", "launch.max_failures": "100",
+    "launch.heartbeat_timeout_s": "10.0",
+}  # fmt: skip
 
 
 @pytest.mark.slow
@@ -31,9 +29,7 @@ SMALL = (
 def test_a_short_run_under_chaos_ends_as_asked_loses_nothing_unaccounted_and_leaves_nothing(tmp_path: Path) -> None:
     path = tmp_path / "chaos.json"
     arguments = ["--config", "", "--minutes", "1.0", "--period", "4", "--keep", str(tmp_path), "--json", str(path)]
-    for setting in SMALL:
-        arguments += ["--set", setting]
-    code = chaos.main(arguments)
+    code = chaos.main(arguments + options(SETTINGS))
     result = json.loads(path.read_text())
     assert code == 0, {name: result[name] for name in ("checks", "leftovers", "resources", "faults")}
     assert len(result["faults"]) >= 2

@@ -16,6 +16,7 @@ import pytest
 from apex_bat.launching.status import figures, read_status
 from apex_bat.roles.resources import began_unix_s
 from apex_bat.storage import StorageError
+from tests.launching.small_run import SMALL, options
 
 pytestmark = [
     pytest.mark.slow,
@@ -23,14 +24,7 @@ pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="signals are POSIX"),
 ]
 
-SMALL = {
-    "actors": "1", "bats_per_actor": "4", "replay.min_size": "200", "replay.capacity": "5_000",
-    "replay.samples_per_insert": "2.0", "learner.batch_size": "16", "learner.weights_period": "5",
-    "network.channels": "[4]", "network.strides": "[3]", "network.hidden": "[16]", "actor.chunk_transitions": "10",
-    "evaluation.flights": "2", "evaluation.period_s": "1.0", "checkpoint.period_s": "1.0",
-    "recording.evaluation_flights": "1", "episode.evaluation_steps": "40", "recording.every_episodes": "0",
-    "launch.heartbeat_timeout_s": "600.0",
-}  # fmt: skip
+SETTINGS = {**SMALL, "recording.every_episodes": "0", "launch.heartbeat_timeout_s": "600.0"}
 PATIENCE_S = 240.0
 """How long anything may take on a machine that others keep busy."""
 
@@ -40,10 +34,8 @@ class Run:
 
     def __init__(self, folder: Path, **changes: str) -> None:
         self.folder = folder
-        settings = SMALL | {name.replace("__", "."): value for name, value in changes.items()}
         command = [sys.executable, "-m", "apex_bat", "train", "--plain", "--run", str(folder)]
-        for name, value in settings.items():
-            command += ["--set", f"{name}={value}"]
+        command += options(SETTINGS, **changes)
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     def status(self) -> dict[str, Any]:

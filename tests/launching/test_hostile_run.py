@@ -18,13 +18,11 @@ import zmq
 from apex_bat.roles.plan import Addresses
 from apex_bat.transport.messages import Report, encode
 from benchmarks.attacks import ON_REPLAY, ON_REPORTS, ON_WEIGHTS, Target
+from tests.launching.small_run import SMALL, options
 
 SETTINGS = {
-    "actors": "1", "bats_per_actor": "4", "replay.min_size": "200", "replay.capacity": "5_000",
-    "replay.samples_per_insert": "2.0", "learner.batch_size": "16", "learner.weights_period": "5",
-    "network.channels": "[4]", "network.strides": "[3]", "network.hidden": "[16]", "actor.chunk_transitions": "10",
-    "evaluation.during_training": "false", "evaluation.flights": "1", "episode.evaluation_steps": "40",
-    "transport.host": "127.0.0.1", "transport.max_message_mb": "1.0", "train.max_updates": "400",
+    **SMALL, "evaluation.during_training": "false", "evaluation.flights": "1", "transport.host": "127.0.0.1",
+    "transport.max_message_mb": "1.0", "train.max_updates": "400",
 }  # fmt: skip
 
 
@@ -54,8 +52,7 @@ def newest_row(path: Path) -> dict[str, Any]:
 @pytest.mark.slow
 def test_a_run_that_strangers_attack_completes_and_counts_them(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    overrides = [argument for name, value in SETTINGS.items() for argument in ("--set", f"{name}={value}")]
-    command = [sys.executable, "-m", "apex_bat", "train", "--run", str(run), *overrides]
+    command = [sys.executable, "-m", "apex_bat", "train", "--run", str(run), *options(SETTINGS)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     attackers = None
     try:

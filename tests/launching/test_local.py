@@ -19,20 +19,11 @@ from apex_bat.launching.course import Course
 from apex_bat.launching.supervisor import Supervisor
 from apex_bat.replay.metrics import declared_name
 from apex_bat.roles.metrics import DECLARED
-
-SMALL = {
-    "actors": "1", "bats_per_actor": "4", "replay.min_size": "200", "replay.capacity": "5_000",
-    "replay.samples_per_insert": "2.0", "learner.batch_size": "16", "learner.weights_period": "5",
-    "network.channels": "[4]", "network.strides": "[3]", "network.hidden": "[16]", "actor.chunk_transitions": "10",
-    "evaluation.flights": "2", "evaluation.period_s": "1.0", "checkpoint.period_s": "1.0",
-    "recording.evaluation_flights": "1", "episode.evaluation_steps": "40",
-}  # fmt: skip
+from tests.launching.small_run import SMALL, options
 
 
 def start(run: Path, **changes: str) -> subprocess.Popen[str]:
-    settings = SMALL | {name.replace("__", "."): value for name, value in changes.items()}
-    overrides = [argument for name, value in settings.items() for argument in ("--set", f"{name}={value}")]
-    command = [sys.executable, "-m", "apex_bat", "train", "--run", str(run), *overrides]
+    command = [sys.executable, "-m", "apex_bat", "train", "--run", str(run), *options(SMALL, **changes)]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, preexec_fn=_hear_ctrl_c
     )

@@ -15,7 +15,8 @@ from apex_bat.launching import local
 from apex_bat.launching.processes import remove_unfinished
 from apex_bat.roles.plan import Role, read_addresses, roles_of
 from apex_bat.storage import write_text
-from tests.launching.test_faults import SMALL, Run
+from tests.launching.small_run import SMALL
+from tests.launching.test_faults import Run
 
 TWO = {"replay__shards": "2", "actors": "2"}
 

@@ -15,6 +15,8 @@ from typing import Any
 import psutil
 import pytest
 
+from tests.launching.small_run import SMALL, options
+
 pytest.importorskip("ray")
 
 pytestmark = [
@@ -23,13 +25,9 @@ pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="Ray has clusters on Linux only"),
 ]
 
-SMALL = {
-    "actors": "2", "bats_per_actor": "4", "replay.min_size": "200", "replay.capacity": "5_000",
-    "replay.samples_per_insert": "2.0", "learner.batch_size": "16", "learner.weights_period": "5",
-    "network.channels": "[4]", "network.strides": "[3]", "network.hidden": "[16]", "actor.chunk_transitions": "10",
-    "evaluation.flights": "1", "evaluation.period_s": "1.0", "checkpoint.period_s": "1.0",
-    "replay.snapshot_period_s": "2.0", "recording.evaluation_flights": "1", "episode.evaluation_steps": "40",
-    "cluster.role_cpus": "0.5", "cluster.learner_resource": "server", "cluster.replay_resource": "server",
+SETTINGS = {
+    **SMALL, "actors": "2", "evaluation.flights": "1", "replay.snapshot_period_s": "2.0", "cluster.role_cpus": "0.5",
+    "cluster.learner_resource": "server", "cluster.replay_resource": "server",
 }  # fmt: skip
 STORE_BYTES = 80 * 2**20
 
@@ -56,10 +54,8 @@ def cluster() -> Iterator[Any]:
 
 
 def start(cluster: Any, run: Path, *words: str, **changes: str) -> subprocess.Popen[str]:
-    settings = SMALL | {name.replace("__", "."): value for name, value in changes.items()}
-    overrides = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
     command = [sys.executable, "-m", "apex_bat", "train", "--cluster", cluster.address, *words]
-    command += ["--run", str(run), *overrides] if "--resume" not in words else []
+    command += ["--run", str(run), *options(SETTINGS, **changes)] if "--resume" not in words else []
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),

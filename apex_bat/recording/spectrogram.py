@@ -82,10 +82,9 @@ def _gammatone_response(
 
 def _low_pass_means(num_samples: int, rate_hz: float) -> NDArray[np.float64]:
     """(samples, times): what each sample adds to the means of the low-passed envelope, the carrier's mean included."""
-    numerator, denominator = signal.butter(2, cochlea.LOW_PASS_HZ, fs=rate_hz)
     impulse = np.zeros(num_samples)
     impulse[0] = 1.0
-    step_response = np.append(0.0, np.cumsum(signal.lfilter(numerator, denominator, impulse)))
+    step_response = np.append(0.0, np.cumsum(signal.lfilter(*cochlea.butterworth(rate_hz), impulse)))
     edges = np.arange(NUM_TIMES + 1) * (num_samples // NUM_TIMES)
     since = np.clip(edges - np.arange(num_samples)[:, None], 0, num_samples)
     return np.asarray(cochlea.CARRIER_MEAN * np.diff(step_response[since], axis=1) * NUM_TIMES / num_samples)

@@ -11,7 +11,6 @@ import math
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy import signal
 
 from apex_bat.experience import NUM_EARS
 from apex_bat.simulation import cochlea
@@ -67,13 +66,14 @@ class BlockLowPass:
 
     def __init__(self, sample_rate_hz: float, num_samples: int, block: int) -> None:
         """Takes a block that divides the number of samples."""
-        numerator, denominator = signal.butter(2, cochlea.LOW_PASS_HZ, fs=sample_rate_hz)
-        residues, poles, direct = signal.residuez(numerator, denominator)
-        residue, pole = residues[0], poles[0]
+        numerator, denominator = cochlea.butterworth(sample_rate_hz)
+        pole = complex(-denominator[1] / 2.0, math.sqrt(denominator[2] - denominator[1] ** 2 / 4.0))
+        residue = np.polyval(numerator[::-1], 1.0 / pole) / (1.0 - pole.conjugate() / pole)
+        direct = numerator[2] / denominator[2]
         step, block_number = np.arange(block), np.arange(num_samples // block)
         lag = step - step[:, None]
         within = np.where(lag >= 0, 2.0 * np.real(residue * pole ** np.maximum(lag, 0)), 0.0)
-        within += direct[0] * np.eye(block)
+        within += direct * np.eye(block)
         from_state = _pairs(2.0 * np.conj(residue * pole**step)).T
         block_lag = block_number - block_number[:, None] - 1
         decay = np.where(block_lag >= 0, pole ** (block * np.maximum(block_lag, 0)), 0.0)

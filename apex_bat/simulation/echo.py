@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from apex_bat.config import settings
 from apex_bat.simulation import acoustics, cochlea
@@ -139,6 +138,8 @@ class Echo:
             return np.asarray(sound)
         if self._is_thesis:
             return np.asarray(sound + self.noise_pa)
+        from scipy import signal  # here: see `cochlea`
+
         return np.asarray(sound + (signal.resample(self.noise_pa, len(carrier), axis=-1) * carrier).real)
 
 

@@ -71,7 +71,10 @@ def receiver(sonar: settings.Sonar) -> Receiver:
 
 def _channel(sonar: settings.Sonar, sound: Numbers, rate_hz: int) -> Complexes:
     """Returns the channel's answer to a sound until it has died away."""
-    return cochlea.gammatone(np.pad(sound, (0, round(_TAIL_S * rate_hz))), sonar.frequency_hz, rate_hz)
+    num_samples = len(sound) + round(_TAIL_S * rate_hz)
+    response = cochlea.gammatone_response(sonar.frequency_hz, rate_hz, num_samples)
+    gain = 1.0 if np.iscomplexobj(sound) else 2.0  # of a real sound the filter sees the positive half
+    return np.asarray(gain * np.convolve(sound, response)[:num_samples])
 
 
 def _baseband(sonar: settings.Sonar, sound: Complexes, rate_hz: int, step: int) -> Complexes:

@@ -14,7 +14,6 @@ from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from apex_bat.config.settings import Body, Episode
 from apex_bat.simulation.ground import ground_plan
@@ -100,13 +99,13 @@ class StartRegion:
         return safe[:count]
 
     def _find_cells(self) -> NDArray[np.float64]:
-        regions, _ = ndimage.label(self._grid_m > self._radius_m)
+        is_free = self._grid_m > self._radius_m
         column, row = (np.rint((np.array(self._arena.start) - self._low) / CELL_M)).astype(int)
-        if regions[column, row] == 0:
+        if not is_free[column, row]:
             raise self._no_start(
                 f"its start {self._arena.start} lies in a wall or nearer than the robot's radius to one"
             )
-        maybe = (regions == regions[column, row]) & (self._grid_m > self._safe_m - CELL_M * math.sqrt(0.5))
+        maybe = connected(is_free, column, row) & (self._grid_m > self._safe_m - CELL_M * math.sqrt(0.5))
         if not maybe.any():
             raise self._no_start(f"nowhere is the clearance more than {self._safe_m} m")
         return np.asarray(self._low + CELL_M * np.argwhere(maybe))
@@ -144,3 +143,27 @@ def _ways_out(body: Body, listening_steps: int) -> NDArray[np.float64]:
         poses = fly_arc(poses, turn_rad, np.full(3, half_m))
         paths.append(poses[:, :2])
     return np.asarray(np.stack(paths, axis=1))
+
+
+def connected(is_free: NDArray[np.bool_], column: int, row: int) -> NDArray[np.bool_]:
+    """Returns the cells (columns, rows) that free ones, side by side, connect with a free one.
+
+    Whole columns and rows of free cells are taken in turn, so that there are as many turns as the way has corners.
+    """
+    reached = np.zeros_like(is_free)
+    reached[column, row] = True
+    num_reached = 0
+    while (count := np.count_nonzero(reached)) > num_reached:
+        num_reached = count
+        reached = _along_rows(_along_rows(reached, is_free).T, is_free.T).T
+    return reached
+
+
+def _along_rows(reached: NDArray[np.bool_], is_free: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Returns the free cells that lie in one unbroken stretch of the last axis with one that is reached."""
+    is_first = is_free.copy()
+    is_first[:, 1:] &= ~is_free[:, :-1]
+    stretch = np.cumsum(is_first).reshape(is_free.shape)
+    is_reached = np.zeros(stretch[-1, -1] + 1, np.bool_)
+    is_reached[stretch[reached]] = True
+    return is_reached[stretch] & is_free

@@ -31,6 +31,22 @@ def test_gammatone_peaks_at_0_db_and_is_one_bandwidth_wide() -> None:
     assert passing[-1] - passing[0] == pytest.approx(cochlea.bandwidth_hz(40_000.0), rel=2e-3)
 
 
+@pytest.mark.parametrize("rate_hz", [125_000.0, 24_000.0 * 64])
+def test_the_impulse_response_written_out_is_what_the_four_filters_answer(rate_hz: float) -> None:
+    impulse = np.zeros(5000, np.complex128)
+    impulse[0] = 1.0
+    expected = cochlea.gammatone(impulse, 40_000.0, rate_hz)
+    found = cochlea.gammatone_response(40_000.0, rate_hz, 5000)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("rate_hz", [24_000.0, 125_000.0, 1_000_000.0])
+def test_the_low_pass_is_the_butterworth_filter_of_scipy(rate_hz: float) -> None:
+    expected = signal.butter(2, cochlea.LOW_PASS_HZ, fs=rate_hz)
+    for found, right in zip(cochlea.butterworth(rate_hz), expected, strict=True):
+        np.testing.assert_allclose(found, right, rtol=1e-9)
+
+
 def test_envelope_of_the_impulse_response_peaks_after_80_us() -> None:
     assert np.argmax(np.abs(impulse_answer())) / RATE_HZ == pytest.approx(80e-6)
 

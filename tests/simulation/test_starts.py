@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from apex_bat.config.settings import Body, Episode
 from apex_bat.simulation.arenas import load_arena
 from apex_bat.simulation.ground import ground_plan
 from apex_bat.simulation.motion import TURN_SIGN, fly_arc, step_length_m, step_turn_rad
-from apex_bat.simulation.starts import StartRegion, start_region
+from apex_bat.simulation.starts import StartRegion, connected, start_region
 
 BODY, EPISODE = Body(), Episode()
 
@@ -27,6 +28,17 @@ def survivors(name: str, starts: np.ndarray, straight_steps: int) -> np.ndarray:
             clear &= ground.clearance_m(poses[:, :2], np.zeros(count, np.int64)) > BODY.diameter_m / 2
         survives |= clear
     return survives
+
+
+@pytest.mark.parametrize("share_free", [0.3, 0.6, 0.9])
+def test_connected_cells_are_those_that_scipy_labels_alike(share_free: float) -> None:
+    generator = np.random.default_rng(3)
+    for _ in range(20):
+        is_free = generator.random(generator.integers(1, 40, 2)) < share_free
+        is_free[0, 0] = True
+        labels, _ = ndimage.label(is_free)
+        column, row = generator.choice(np.argwhere(is_free))
+        np.testing.assert_array_equal(connected(is_free, column, row), labels == labels[column, row])
 
 
 @pytest.mark.parametrize("name", ["simple", "narrow", "maze"])

@@ -17,6 +17,7 @@ from apex_bat.config import Config
 from apex_bat.launching import ONE_THREAD
 from apex_bat.launching.leftovers import is_needed
 from apex_bat.launching.supervisor import Exit
+from apex_bat.roles.orders import STOP
 from apex_bat.roles.plan import Role
 
 KILL_TIMEOUT_S = 2.0
@@ -55,7 +56,7 @@ class RoleProcess:
         Raises:
             OSError: it cannot be started.
         """
-        self._role, self._run, self._cleans = role, run, cleans
+        self._role, self._run, self._cleans, self._is_ordered = role, run, cleans, orders is not None
         self._log = run / "logs" / f"{role.name}.log"
         command = [sys.executable, "-m", "apex_bat", role.kind, "--run", str(run), "--leash",
                    "--number", str(role.number), "--incarnation", str(incarnation),
@@ -98,7 +99,9 @@ class RoleProcess:
         return Exit(code, last_line(self._log))
 
     def stop(self) -> None:
-        """Lets go of the leash."""
+        """Asks it to save and end: lets go of the leash."""
+        if self._is_ordered:
+            self.tell(STOP)
         if self._process.stdin is not None and not self._process.stdin.closed:
             with suppress(OSError):  # of orders that it did not read before it ended; the pipe is closed all the same
                 self._process.stdin.close()

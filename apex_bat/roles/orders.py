@@ -1,7 +1,8 @@
 """What a launcher tells a role on its standard input: addresses and keys at first, later where a server has moved to.
 
-A line of JSON each. A pipe is seen by nobody else, so that keys need no file on the role's host. The end of the input
-means stop, as with every leash.
+A line of JSON each. A pipe is seen by nobody else, so that keys need no file on the role's host. The line STOP before
+the end of the input means that the role is to save and end; an end without it, that its keeper has died. Then nobody is
+left who could say when the role has ended, and its replacement waits for it: it must be quick.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 from msgspec import Struct
@@ -17,6 +18,10 @@ from msgspec import Struct
 from apex_bat.roles.plan import Addresses
 from apex_bat.transport.security import Keys, TransportError
 
+STOP = b'"stop"\n'
+"""The last line."""
+ORPHANED_S = 1.0
+"""How long a role whose keeper has died may take for its last files."""
 MAX_LINE_BYTES = 1 << 16
 """Of one order: addresses take 500 bytes, 500 allowed clients 22,000."""
 FIRST_ORDERS_S = 30.0
@@ -58,6 +63,8 @@ class StandingOrders:
         self._news: deque[Addresses] = deque(maxlen=1)  # what is added meanwhile is not lost, as with a swap
         self._addresses: Addresses | None = None
         self._arrived = threading.Event()
+        self.is_orphan = True
+        """Whether the end of the orders would mean that whoever gave them has died."""
         self.keys: Keys | None = None
         """CURVE keys of the run; None without."""
 
@@ -69,9 +76,12 @@ class StandingOrders:
             self._rest = b""
         for line in lines:
             try:
-                orders = msgspec.json.decode(line, type=Orders)
+                orders = msgspec.json.decode(line, type=Orders | Literal["stop"])
             except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
                 _log.error("standard input: a line of %d bytes is no order", len(line))
+                continue
+            if isinstance(orders, str):
+                self.is_orphan = False
                 continue
             if orders.keys is not None:
                 self.keys = _as_keys(orders.keys)

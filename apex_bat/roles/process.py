@@ -9,7 +9,6 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
@@ -17,7 +16,7 @@ from types import FrameType
 from apex_bat.config import Config, ConfigError, load
 from apex_bat.replay.snapshot import SnapshotError
 from apex_bat.roles.logs import RotatingLog
-from apex_bat.roles.orders import StandingOrders
+from apex_bat.roles.orders import ORPHANED_S, StandingOrders
 from apex_bat.roles.plan import Addresses, Assignment, Kind, Role, read_addresses, role_of
 from apex_bat.storage import StorageError
 from apex_bat.transport.security import AddressInUseError, TransportError
@@ -66,7 +65,7 @@ def run_process(
         orders = StandingOrders() if is_ordered else None
         if leashed or is_ordered:
             _write_log(role, run, config)
-            hold_leash(stop, config.launch.grace_s, orders.heed if orders is not None else None)
+            hold_leash(stop, config.launch.grace_s, orders)
         _run(_assigned(Assignment(role, config, run, Addresses("", "", ""), stop, incarnation, flown_steps), orders))
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -92,22 +91,24 @@ def _assigned(given: Assignment, orders: StandingOrders | None) -> Assignment:
     return given._replace(addresses=addresses, moved=orders.moved, given_keys=orders.keys)
 
 
-def hold_leash(stop: threading.Event, grace_s: float, heed: Callable[[bytes], None] | None = None) -> None:
+def hold_leash(stop: threading.Event, grace_s: float, orders: StandingOrders | None = None) -> None:
     """Watches standard input in a thread: at its end, the role is asked to stop, and ended by force after its grace.
 
-    What comes on standard input before its end goes to `heed`.
+    What comes on standard input before its end are orders. An orphan's grace is `orders.ORPHANED_S` at most.
 
     The end by force needs nothing of Python, so that a role that is blocked in C code ends too; it leaves in the log
     where the role was. A stopped process is continued by the kernel when its launcher dies (Linux), or it would stay.
     """
     _be_continued_when_orphaned()
-    threading.Thread(target=_watch_leash, args=(stop, grace_s, heed), daemon=True).start()
+    threading.Thread(target=_watch_leash, args=(stop, grace_s, orders), daemon=True).start()
 
 
-def _watch_leash(stop: threading.Event, grace_s: float, heed: Callable[[bytes], None] | None) -> None:
+def _watch_leash(stop: threading.Event, grace_s: float, orders: StandingOrders | None) -> None:
     while data := os.read(0, 4096):  # not sys.stdin: its lock, held here, would abort the interpreter's end
-        if heed is not None:
-            heed(data)
+        if orders is not None:
+            orders.heed(data)
+    if orders is not None and orders.is_orphan:
+        grace_s = min(grace_s, ORPHANED_S)
     faulthandler.dump_traceback_later(grace_s, exit=True)
     stop.set()
 

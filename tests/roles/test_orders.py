@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from apex_bat.roles.orders import MAX_LINE_BYTES, GivenKeys, StandingOrders, line_of
+from apex_bat.roles.orders import MAX_LINE_BYTES, STOP, GivenKeys, StandingOrders, line_of
 from apex_bat.roles.plan import Addresses
 from apex_bat.transport.security import TransportError, new_keys
 
@@ -29,6 +29,16 @@ def test_later_orders_are_news_once_and_leave_the_keys() -> None:
     assert orders.moved() is None
     assert orders.keys == keys
     assert keys.server_secret is None
+
+
+def test_an_end_without_stop_makes_an_orphan() -> None:
+    orders = StandingOrders()
+    orders.heed(line_of(FIRST) + line_of(NEXT))
+    assert orders.is_orphan
+    orders.heed(STOP)
+    assert not orders.is_orphan
+    assert orders.first() == FIRST
+    assert orders.moved() == NEXT
 
 
 def test_bytes_may_come_in_any_pieces() -> None:

@@ -18,7 +18,7 @@ from apex_bat.config import load
 from apex_bat.config.loading import dumps
 from apex_bat.evaluation import runs
 from apex_bat.launching.processes import RoleProcess, remove_unfinished
-from apex_bat.roles.orders import line_of
+from apex_bat.roles.orders import ORPHANED_S, STOP, line_of
 from apex_bat.roles.plan import Addresses, Role
 from apex_bat.roles.resources import began_unix_s
 from apex_bat.transport.messages import Report
@@ -75,6 +75,32 @@ def test_a_role_whose_launcher_is_killed_ends_whatever_it_does(body: str) -> Non
         launcher.stdout.close()
         if began_unix_s(pid) is not None:
             os.kill(pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize(("last", "longest_s"), [(b"", 10.0), (STOP, None)])
+def test_a_role_whose_keeper_died_is_ended_long_before_its_grace_and_one_that_is_asked_to_end_is_not(
+    last: bytes, longest_s: float | None
+) -> None:
+    child = CHILD.format(body=BODIES["sleeps"]).replace(
+        "hold_leash(stop, 0.5)",
+        "from apex_bat.roles.orders import StandingOrders\nhold_leash(stop, 1000.0, StandingOrders())",
+    )
+    process = subprocess.Popen([sys.executable, "-c", child], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        process.stdout.readline()
+        process.stdin.write(last)
+        process.stdin.close()
+        if longest_s is not None:
+            assert process.wait(longest_s) != 0
+        else:
+            with pytest.raises(subprocess.TimeoutExpired):
+                process.wait(2.0 * ORPHANED_S)
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
 
 
 def _is_stopped(pid: int) -> bool:

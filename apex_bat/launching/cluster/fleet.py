@@ -100,7 +100,7 @@ class Fleet:
         if former is not None:
             former.dismiss()
             if role.kind != "actor" and former.hearing.lost_s is not None:
-                not_before_s = former.hearing.gone_s(self._config.launch.grace_s)
+                not_before_s = former.hearing.gone_s()
         return Kept(role, self._config.cluster.lease_s, time.monotonic(), not_before_s)
 
     def _clean_after(self, role: Role) -> None:

@@ -11,6 +11,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from apex_bat.roles.orders import ORPHANED_S
+
 MARGIN_S = 0.5
 """What the launcher waits beyond: for the keeper's kill to be done, and for clocks that run unequally fast."""
 
@@ -75,15 +77,15 @@ class Hearing:
         if self.lost_s is None:
             self.lost_s = now_s
 
-    def gone_s(self, grace_s: float) -> float:
+    def gone_s(self) -> float:
         """Returns from when on nothing runs there that was started by a keeper that is gone; infinite if it is not.
 
-        A dead keeper enforces no lease. Its end is the end of its role's leash, which has `grace_s` for its last files;
-        and the keeper may have died just before that was known.
+        A dead keeper enforces no lease. Its end is the end of its role's leash, which has ORPHANED_S for its last
+        files; and the keeper may have died just before that was known.
         """
         if self.lost_s is None:
             return float("inf")
-        return self.lost_s + grace_s + MARGIN_S if self.may_run else self.lost_s
+        return self.lost_s + ORPHANED_S + MARGIN_S if self.may_run else self.lost_s
 
     def is_over(self, now_s: float) -> bool:
         """Whether the keeper's lease has ended for certain."""

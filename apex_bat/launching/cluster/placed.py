@@ -133,4 +133,4 @@ class Placed:
 
         The last files of that must not meet those of the replacement. Actors write nothing that counts.
         """
-        return self.role.kind == "actor" or self._clock() >= self._hearing.gone_s(self._config.launch.grace_s)
+        return self.role.kind == "actor" or self._clock() >= self._hearing.gone_s()

@@ -187,7 +187,7 @@ def _await_leases(config: Config, run: Path) -> None:
     except StorageError:  # of a new run there is none
         has_ended = not (run / STATUS).exists()
     if not has_ended:
-        wait_s = max(config.cluster.lease_s, config.launch.grace_s) + MARGIN_S
+        wait_s = config.cluster.lease_s + MARGIN_S  # an orphan ends sooner
         _log.warning("the former launcher did not end the run: waits %.0f s for what it may have left running", wait_s)
         time.sleep(wait_s)
 

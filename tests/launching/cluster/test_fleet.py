@@ -12,15 +12,15 @@ from typing import NamedTuple
 import msgspec
 import pytest
 
-from apex_bat.config import Config, load
+from apex_bat.config import load
 from apex_bat.launching.cluster import places as module
 from apex_bat.launching.cluster.fleet import Fleet
 from apex_bat.launching.cluster.keeper import Look, Site
 from apex_bat.launching.cluster.kept import MOST_FAILED_STARTS, LostError
-from apex_bat.launching.cluster.lease import MARGIN_S, Hearing
+from apex_bat.launching.cluster.lease import Hearing
 from apex_bat.launching.cluster.placed import Placed
 from apex_bat.launching.supervisor import USELESS
-from apex_bat.roles.orders import Orders
+from apex_bat.roles.orders import ORPHANED_S, Orders
 from apex_bat.roles.plan import Role, read_addresses
 from apex_bat.roles.process import ADDRESSES
 from apex_bat.transport.reports import ReportCollector
@@ -462,63 +462,6 @@ def test_addresses_are_written_for_those_with_keys_and_follow_the_servers(stage:
         collector.close()
 
 
-class Clock:
-    """Shows what the test says."""
-
-    now_s = 0.0
-
-    def __call__(self) -> float:
-        return self.now_s
-
-
-def placed_on(role: Role, clock: Clock, config: Config = CONFIG) -> tuple[Placed, list[str]]:
-    hearing, orders = Hearing(20.0), list[str]()
-    placed = Placed(role, 1, "1 CPU", config, hearing, orders.append, clock)
-    placed.take_site(Site("h", "10.0.0.1", 5000, ""))
-    placed.begin()
-    placed.take_start(7)
-    hearing.take(0.0, 1)
-    return placed, orders
-
-
-def test_a_writer_whose_keeper_died_has_the_grace_to_write_its_last_files() -> None:
-    for role, wait_s in ((LEARNER, CONFIG.launch.grace_s + MARGIN_S), (REPLAY, 1.0 + MARGIN_S), (ACTOR, 0.0)):
-        clock = Clock()
-        placed, _ = placed_on(role, clock)
-        clock.now_s = lost_s = 15.0  # heard last at 0
-        placed.take_loss("it died")
-        clock.now_s = lost_s + wait_s - 1e-3
-        assert (placed.poll() is None) == (wait_s > 0.0)
-        clock.now_s = lost_s + wait_s
-        ended = placed.poll()
-        assert ended is not None
-        assert ended.is_lost
-
-
-def test_a_lost_keeper_enforces_no_lease() -> None:
-    clock, config = Clock(), load(None, ["cluster.lease_s=2.0", "launch.grace_s=30.0"])
-    placed, _ = placed_on(LEARNER, clock, config)
-    clock.now_s = 1.0
-    placed.take_loss("it died")
-    clock.now_s = 1.0 + 30.0
-    assert placed.poll() is None, "the lease of 2 s, or of the 20 s that were heard, says nothing"
-    clock.now_s += MARGIN_S
-    assert placed.poll() is not None
-
-
-def test_a_life_that_has_not_begun_waits_for_what_the_former_one_may_have_left_on_the_same_keeper() -> None:
-    clock, hearing = Clock(), Hearing(20.0)
-    former = Placed(LEARNER, 1, "1 CPU", CONFIG, hearing, lambda _: None, clock)
-    former.begin()
-    former.take_error(OSError("its host does not answer"))  # the order may have come through
-    hearing.take(0.0, 1)
-    placed = Placed(LEARNER, 2, "1 CPU", CONFIG, hearing, lambda _: None, clock)
-    placed.take_loss("it died")
-    assert placed.poll() is None
-    clock.now_s = CONFIG.launch.grace_s + MARGIN_S
-    assert placed.poll() is not None
-
-
 def test_a_keeper_that_was_lost_between_two_lives_is_replaced_after_the_grace(fleet: Fleet, stage: Stage) -> None:
     first = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER)]
     until(lambda: all(each.pid for each in first))
@@ -529,24 +472,4 @@ def test_a_keeper_that_was_lost_between_two_lives_is_replaced_after_the_grace(fl
     lost_s = time.monotonic()
     fleet.start(REPLAY, 1, 0)
     until(lambda: len(stage.hosts) == 3)
-    assert time.monotonic() - lost_s > CONFIG.launch.grace_s - 0.5
-
-
-def test_a_role_without_a_place_ends_when_it_is_asked_to() -> None:
-    for end in (Placed.stop, Placed.kill):
-        placed = Placed(ACTOR, 1, "1 CPU", CONFIG, Hearing(20.0), lambda _: None)
-        end(placed)
-        assert placed.poll() is not None
-    placed, orders = placed_on(ACTOR, Clock())
-    placed.stop()
-    placed.kill()
-    assert orders == ["stop", "kill"]
-    assert placed.poll() is None, "until its keeper says so"
-
-
-def test_a_keeper_that_never_worked_counts_as_a_failure_of_the_role() -> None:
-    placed = Placed(ACTOR, 1, "1 CPU", CONFIG, Hearing(20.0), lambda _: None)
-    placed.take_loss("cannot import")
-    ended = placed.poll()
-    assert ended is not None
-    assert (ended.code, ended.is_lost) == (1, False)
+    assert time.monotonic() - lost_s > ORPHANED_S

@@ -3,7 +3,10 @@
 A server, its good peers and one attacker are processes; the peers do as much as they can. Windows with and without the
 attack alternate, and the ratio is of the medians. The attacker is paced, because on few cores its own work would
 otherwise be what is measured. Then the peers are ended, and what the attack alone costs the server is measured as its
-CPU time: that figure also holds on a machine that has other work. `python -m benchmarks.hostile [FILE]`, ten minutes.
+CPU time: that figure also holds on a machine that has other work.
+
+    python -m benchmarks.hostile docs/results/hostile.json            ten minutes
+    python -m benchmarks.hostile docs/results/hostile.json weights    one socket anew
 """
 
 from __future__ import annotations
@@ -241,7 +244,16 @@ def table(records: Sequence[Record]) -> str:
     return "\n".join(lines)
 
 
+def main(path: Path, only: Sequence[str]) -> None:
+    """Measures all sockets, or some of them anew, writes the records and prints their table."""
+    former: list[Record] = json.loads(path.read_text(encoding="utf-8")) if only else []
+    records: list[Record] = []
+    for setup in SETUPS:
+        kept = [record for record in former if record["socket"] == setup.name]
+        records += measure(setup) if setup.name in only or not only else kept
+    path.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+    print(table(records))
+
+
 if __name__ == "__main__":
-    found = [record for setup in SETUPS for record in measure(setup)]
-    text = json.dumps(found, indent=1) + "\n"
-    Path(sys.argv[1]).write_text(text, encoding="utf-8") if len(sys.argv) > 1 else print(text, end="")
+    main(Path(sys.argv[1]), sys.argv[2:])

@@ -1,6 +1,6 @@
 """How a run scales: costs measured here, a model of queues fed with them, its predictions beside real runs and beyond.
 
-Run it with `apex-bat bench scaling` or `python -m benchmarks.scaling`: 5 minutes on a machine that does nothing else.
+Run it with `apex-bat bench scaling` or `python -m benchmarks.scaling`: 7 minutes on a machine that does nothing else.
 `scaling_model` is the model, `scaling_page` makes docs/scaling.md of the records.
 """
 
@@ -23,8 +23,8 @@ from benchmarks.scaling_costs import costs_of, measure_costs
 from benchmarks.scaling_model import Costs, Outcome, Run, Simulation
 from benchmarks.system import read_rows
 
-RUN_MINUTES = 0.5
-SETTLED_S = 10.0  # rows before this are left out
+RUN_MINUTES = 0.75
+SETTLED_S = 20.0  # of flight: rows before are left out, as further actors still start
 SIMULATED_S = 60.0
 
 

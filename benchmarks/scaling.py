@@ -1,6 +1,6 @@
 """How a run scales: costs measured here, a model of queues fed with them, its predictions beside real runs and beyond.
 
-Run it with `apex-bat bench scaling` or `python -m benchmarks.scaling`: 7 minutes on a machine that does nothing else.
+Run it with `apex-bat bench scaling` or `python -m benchmarks.scaling`: 17 minutes on a machine that does nothing else.
 `scaling_model` is the model, `scaling_page` makes docs/scaling.md of the records.
 """
 
@@ -23,8 +23,9 @@ from benchmarks.scaling_costs import costs_of, measure_costs
 from benchmarks.scaling_model import Costs, Outcome, Run, Simulation
 from benchmarks.system import read_rows
 
-RUN_MINUTES = 0.75
-SETTLED_S = 20.0  # of flight: rows before are left out, as further actors still start
+ROUNDS = 3  # of all real runs: others on the machine slow one of them down
+RUN_MINUTES = 0.5
+SETTLED_S = 12.0  # of flight: rows before are left out, as further actors still start
 SIMULATED_S = 60.0
 
 
@@ -41,6 +42,14 @@ class Setup(NamedTuple):
 
 
 SETUPS = (Setup(1, 8.0), Setup(2, 8.0), Setup(4, 8.0), Setup(8, 8.0), Setup(1, 0.5), Setup(8, 0.5))
+
+
+class Rates(NamedTuple):
+    """What a real run did."""
+
+    steps_per_s: float
+    updates_per_s: float
+    samples_per_insert: float
 
 
 class Scale(NamedTuple):
@@ -82,10 +91,11 @@ def measure() -> list[Record]:
     records = measure_costs()
     costs = costs_of(records)
     cores = os.cpu_count() or 1
-    for setup in SETUPS:
-        config = _config(setup)
-        records += outcome_records(f"scaling.predicted.{setup.name}", predict(config, costs, cores))
-        records += _measured(f"scaling.measured.{setup.name}", setup)
+    rounds = [[_measured(setup) for setup in SETUPS] for _ in range(ROUNDS)]
+    for setup, rates in zip(SETUPS, zip(*rounds, strict=True), strict=True):
+        records += outcome_records(f"scaling.predicted.{setup.name}", predict(_config(setup), costs, cores))
+        for field, unit, values in zip(Rates._fields, ("1/s", "1/s", "1"), zip(*rates, strict=True), strict=True):
+            records.append(summary(f"scaling.measured.{setup.name}.{field}", unit, list(values)))
     return records + predictions(costs)
 
 
@@ -127,8 +137,8 @@ def _config(setup: Setup) -> Config:
     return load(None, [f"actors={setup.actors}", f"replay.samples_per_insert={setup.samples_per_insert:g}"])
 
 
-def _measured(name: str, setup: Setup) -> list[Record]:
-    """Returns the rates of a real run between its first and last row that count."""
+def _measured(setup: Setup) -> Rates:
+    """Returns what a real run did between its first and last row that count."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         settings = {
@@ -143,11 +153,7 @@ def _measured(name: str, setup: Setup) -> list[Record]:
     flown = [_rate(rows[f"actor-{number}"], "env_steps") for number in range(setup.actors)]
     replay = rows["replay"]
     inserted, sampled = _rate(replay, "replay.inserted"), _rate(replay, "replay.sampled")
-    return [
-        summary(f"{name}.steps_per_s", "1/s", [sum(flown)]),
-        summary(f"{name}.updates_per_s", "1/s", [_rate(rows["learner"], "updates")]),
-        summary(f"{name}.samples_per_insert", "1", [sampled / inserted]),
-    ]
+    return Rates(sum(flown), _rate(rows["learner"], "updates"), sampled / inserted)
 
 
 def _rate(rows: list[dict[str, Any]], name: str) -> float:

@@ -139,8 +139,8 @@ _MODEL = """## The model beside real runs
 
 `benchmarks/scaling_model.py` simulates a run event by event: CPU of every role, cores shared evenly, the servers'
 queues and turns, the actors' windows, the learner's prefetch, the law of samples per insert. It leaves out the network,
-memory, the launcher and start-up. Real runs of 45 s of flight, the last 25 of them counted, on the same two shared
-cores, defaults but for what the table names:
+memory, the launcher and start-up. Real runs of 30 s of flight, the last 18 of them counted, medians
+of three rounds, on the same two shared cores, defaults but for what the table names:
 """
 
 _AT = """## On 10, 100 and 1,000 cores (predicted)

@@ -174,8 +174,8 @@ Learning begins when one server has its part of `min_size`: its band lets a batc
 That is at about `min_size` transitions, because inserts go to the servers in turn, and earlier while some are away.
 
 A server that is lost is left out until it has come back from its snapshot: learner and actors go on with the others.
-Each server is a role of its own: `replay-0`, `replay-1`, with its snapshot, metrics and log. A serial run and a run on
-a cluster have one server.
+Each server is a role of its own: `replay-0`, `replay-1`, with its snapshot, metrics and log. A serial run has one
+server. On a cluster each has a place of its own ([cluster](cluster.md)).
 
 When more than one pays: when a server's core is busy, which by the figures above takes some dozens of actors that
 nobody holds back; or when the replay is larger than the memory of one host. Draws from several servers cost more than

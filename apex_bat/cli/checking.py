@@ -25,9 +25,8 @@ def check(config: Config, *, serial: bool = False, on_cluster: bool = False) -> 
         from apex_bat.launching.serial import settings_of
 
         settings_of(config)
-    if config.replay.shards > 1 and (serial or on_cluster):
-        mode = "a serial run" if serial else "a run on a cluster"
-        raise ConfigError(f"replay.shards is {config.replay.shards}, and {mode} has one replay: set it to 1")
+    if config.replay.shards > 1 and serial:
+        raise ConfigError(f"replay.shards is {config.replay.shards}, and a serial run has one replay: set it to 1")
     try:
         limiter_of(config)
     except ValueError as error:

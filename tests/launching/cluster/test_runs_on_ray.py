@@ -128,6 +128,32 @@ def test_too_few_resources_are_named_instead_of_waited_for_in_silence(cluster: A
     assert json.loads((run / "run.json").read_text())["outcome"] == "failed"
 
 
+def test_several_servers_share_the_replay_and_a_killed_one_takes_part_again(cluster: Any, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    process = start(cluster, run, replay__shards="2", train__max_minutes="30.0")
+
+    def inserted(server: str) -> float:
+        return float(status(run)[server].get("metrics", {}).get("replay.inserted", 0.0))
+
+    def is_shared() -> bool:
+        away = status(run)["learner"].get("metrics", {}).get("reader.servers_away", 1.0)
+        return away == 0.0 and min(inserted("replay-0"), inserted("replay-1")) > 0.0
+
+    try:
+        eventually(lambda: step(run) > 20 or process.poll() is not None, 60.0, "the learner learns")
+        eventually(is_shared, 30.0, "both servers hold experience, and the learner draws from both")
+        _kill_role(run, "replay-1")
+        eventually(is_shared, 30.0, "the killed one takes part again")
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=30)
+        assert process.returncode == 130, output
+        assert len(list((run / "replay").glob("replay-*.snapshot"))) == 2
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
 def test_training_goes_on_when_a_role_a_keeper_and_a_node_are_killed_and_grows_with_the_cluster(
     cluster: Any, tmp_path: Path
 ) -> None:

@@ -175,6 +175,7 @@ def _socket(target: Target) -> zmq.Socket[bytes]:
     attacker: zmq.Socket[bytes] = zmq.Context.instance().socket(target.kind)
     attacker.setsockopt(zmq.LINGER, 0)
     attacker.setsockopt(zmq.SNDHWM, 10)
+    attacker.setsockopt(zmq.RCVHWM, 10)
     attacker.setsockopt(zmq.RECONNECT_IVL, 50)
     attacker.connect(target.address)
     return attacker

@@ -256,4 +256,7 @@ def main(path: Path, only: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2:])
+    given, names = sys.argv[1:2], sys.argv[2:]
+    if not given or set(names) - {setup.name for setup in SETUPS}:
+        sys.exit(f"{(__doc__ or '').strip()}\n\nsockets: {', '.join(setup.name for setup in SETUPS)}")
+    main(Path(given[0]), names)

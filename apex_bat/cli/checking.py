@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from apex_bat.config import Config, ConfigError
 
 _BYTES_A_TRANSITION = 1024  # on the wire, at most: a chunk of one transition brings four frames of 192 bytes along
+_HEADER_BYTES = 1 << 14  # of a message of weights: names and shapes
 
 
 def check(config: Config, *, serial: bool = False, on_cluster: bool = False) -> None:
@@ -35,14 +37,25 @@ def check(config: Config, *, serial: bool = False, on_cluster: bool = False) -> 
     for arena in dict.fromkeys((config.arena, *config.evaluation.arenas)):
         load_arenas(arena)
     try:
-        parameter_shapes(config.network, config.state_steps)
+        shapes = parameter_shapes(config.network, config.state_steps)
     except ValueError as error:
         raise ConfigError(str(error)) from None
+    _check_weights(config, sum(math.prod(shape) for shape in shapes.values()))
     keys = load_keys(Path(config.transport.keys)) if config.transport.keys else None
     if on_cluster and config.transport.host != "ipc":
         raise ConfigError("transport.host: on a cluster each role listens at its node's address; leave it out")
     if config.transport.host != "ipc":
         check_address(f"tcp://{config.transport.host}:{config.transport.base_port}", keys)
+
+
+def _check_weights(config: Config, num_parameters: int) -> None:
+    """Refuses settings with which actors would refuse the learner's weights."""
+    needed_mb = (4 * num_parameters + _HEADER_BYTES) / 2**20
+    if config.transport.max_message_mb < needed_mb:
+        raise ConfigError(
+            f"transport.max_message_mb {config.transport.max_message_mb:g} is less than the {needed_mb:.3g} MB that "
+            f"weights of {num_parameters} parameters take"
+        )
 
 
 def _check_inserts(config: Config) -> None:

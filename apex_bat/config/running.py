@@ -106,7 +106,7 @@ class Launch(Section, frozen=True):
     heartbeat_timeout_s: Positive = 30.0
     """A role that was heard and then not for this long is killed and replaced; each reports every second."""
     grace_s: Positive = 8.0
-    """How long a role may take to end after it was asked to, or after the launcher was killed."""
+    """How long a role may take to end after it was asked to, or after the launcher was killed (1 s on a cluster)."""
     stall_s: Positive = 60.0
     """Time without an environment step or an update after which view, status and log say so, and who waits for whom."""
     dense_rows_s: Positive = 3600.0

@@ -102,6 +102,7 @@ class Actor:
     def is_ready(self, timeout_s: float) -> bool:
         """Says whether a step can be taken now; else waits for weights or for the replay, and reports for whom."""
         self._writer.poll(0.0)
+        self._weights.wait(0.0)  # whoever is held back, or looks seldom, says so that it still wants what is new
         if self._learner_step < 0 and not self._take_up_weights(timeout_s):
             return self._wait("waiting for the learner's first weights")
         if not self._writer.has_room:

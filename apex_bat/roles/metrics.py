@@ -50,7 +50,7 @@ LEARNER_METRICS: dict[str, Metric] = {
     "share.update": Metric("1", "share of the time spent on updates"),
     "share.weights": Metric("1", "share of the time spent on broadcasts"),
     "share.checkpoint": Metric("1", "share of the time spent on checkpoints"),
-    "weights.subscribers": Metric("subscribers", "actors and evaluators that asked for weights within the last 10 s"),
+    "weights.subscribers": Metric("subscribers", "actors that asked for weights within the last 10 s"),
     **{f"weights.refused.{reason}": Metric("messages", REASONS[reason]) for reason in PUBLISHER_REASONS},
     **READER_METRICS,
     **PROCESS_METRICS,

@@ -158,6 +158,8 @@ def _run(assignment: Assignment) -> None:
         from apex_bat.roles.learner import run_learner as run
     else:
         from apex_bat.roles.evaluator import run_evaluator as run
+    if assignment.stop.is_set():  # by a leash that ended while it was imported: its replacement may be at work
+        return
     _log.info("starts, pid %d", os.getpid())
     run(assignment)
     _log.info("ends")

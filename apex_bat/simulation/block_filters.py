@@ -68,8 +68,8 @@ class BlockLowPass:
         """Takes a block that divides the number of samples."""
         numerator, denominator = cochlea.butterworth(sample_rate_hz)
         pole = complex(-denominator[1] / 2.0, math.sqrt(denominator[2] - denominator[1] ** 2 / 4.0))
-        residue = np.polyval(numerator[::-1], 1.0 / pole) / (1.0 - pole.conjugate() / pole)
-        direct = numerator[2] / denominator[2]
+        residue = complex(np.polyval(numerator[::-1], 1.0 / pole)) / (1.0 - pole.conjugate() / pole)
+        direct = float(numerator[2] / denominator[2])
         step, block_number = np.arange(block), np.arange(num_samples // block)
         lag = step - step[:, None]
         within = np.where(lag >= 0, 2.0 * np.real(residue * pole ** np.maximum(lag, 0)), 0.0)
@@ -78,7 +78,7 @@ class BlockLowPass:
         block_lag = block_number - block_number[:, None] - 1
         decay = np.where(block_lag >= 0, pole ** (block * np.maximum(block_lag, 0)), 0.0)
         self._block = block
-        self._state_of = _pairs(pole ** (block - step)).astype(np.float32)
+        self._state_of = _pairs(np.complex128(pole) ** (block - step)).astype(np.float32)
         self._carry = _rotations(decay).astype(np.float32)
         self._envelope_of = np.concatenate([within, from_state]).astype(np.float32)
 

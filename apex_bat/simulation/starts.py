@@ -153,7 +153,7 @@ def connected(is_free: NDArray[np.bool_], column: int, row: int) -> NDArray[np.b
     reached = np.zeros_like(is_free)
     reached[column, row] = True
     num_reached = 0
-    while (count := np.count_nonzero(reached)) > num_reached:
+    while (count := int(np.count_nonzero(reached))) > num_reached:
         num_reached = count
         reached = _along_rows(_along_rows(reached, is_free).T, is_free.T).T
     return reached

@@ -30,7 +30,8 @@ REASONS: dict[str, str] = {
 """Every reason for which a listening socket refuses something, and what it means."""
 
 PUBLISHER_REASONS = (
-    "foreign", "protocol", "generation", "size", "parts", "header", "unexpected", "flood", "key", "handshake",
+    "foreign", "protocol", "generation", "size", "parts", "header", "shape", "value", "unexpected", "flood", "key",
+    "handshake",
 )  # fmt: skip
 """Those for which a publisher of weights does."""
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from apex_bat.transport.messages import MessageError, Subscription, Weights, decode, encode
 from apex_bat.transport.refusals import Refusals
-from apex_bat.transport.security import Keys
+from apex_bat.transport.security import Keys, TransportError
 from apex_bat.transport.sockets import MAX_MESSAGE_BYTES, Connection, Listener
 
 logger = logging.getLogger(__name__)
@@ -32,10 +32,10 @@ _NOTHING = (-1, 0)  # version and learner step of no weights
 
 HIGH_WATER = 4  # broadcasts queued for one slow subscriber; older ones are of no use
 RENEW_S = 1.0  # between two subscriptions of one subscriber
-LEAST_S = 0.5  # the same; what comes earlier is not looked at: who subscribes all the time gets no more than the rest
+REPEAT_S = 2.0  # after which a subscriber that says it has older weights is sent the same ones again
 LAPSE_S = 10.0  # without a renewal until nothing more is sent
 MAX_SUBSCRIBERS = 10_000
-AT_ONCE = 100  # subscriptions looked at by one call
+AT_ONCE = 1000  # subscriptions looked at by one call
 MAX_SUBSCRIPTION_BYTES = 1024  # handshakes have 200 to 400, a subscription less than 100
 
 
@@ -69,7 +69,8 @@ class WeightsPublisher:
         self._clock = clock
         self._newest: zmq.Frame | None = None
         self._newest_is = _NOTHING
-        self._heard_s: dict[bytes, float] = {}  # when each subscriber, by its routing id, last subscribed
+        self._subscribers: dict[bytes, _Subscriber] = {}  # by routing id
+        self._prune_s = clock() + RENEW_S
         self._listener = Listener(
             zmq.ROUTER,
             address,
@@ -82,8 +83,8 @@ class WeightsPublisher:
 
     @property
     def num_subscribers(self) -> int:
-        """Subscribers that have not lapsed, as far as the last call saw."""
-        return len(self._heard_s)
+        """Subscribers that were heard in the last LAPSE_S, as far as the last call saw."""
+        return len(self._subscribers)
 
     def publish(self, version: int, learner_step: int, arrays: Mapping[str, NDArray[np.float32]]) -> None:
         """Broadcasts weights; they are copied.
@@ -96,25 +97,35 @@ class WeightsPublisher:
         contiguous = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in arrays.items()}
         self._newest = zmq.Frame(encode(Weights(version, learner_step, contiguous), self._generation))
         self._newest_is = (version, learner_step)
-        lapsed_s = self._clock() - LAPSE_S
-        self._heard_s = {subscriber: heard_s for subscriber, heard_s in self._heard_s.items() if heard_s > lapsed_s}
-        for subscriber in self._heard_s:
-            self._send(subscriber)
+        now_s = self._clock()
+        self._prune(now_s)
+        for identity, subscriber in self._subscribers.items():
+            self._send(identity, subscriber, now_s)
 
     def serve(self) -> None:
         """Takes subscriptions, and sends the newest weights to those who do not have them. Call it often."""
+        now_s = self._clock()
+        if now_s >= self._prune_s:
+            self._prune(now_s)
         for _ in range(AT_ONCE):
             try:
-                subscriber, *parts = self._listener.socket.recv_multipart(zmq.NOBLOCK)
+                identity, *parts = self._listener.socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            self._take(subscriber, parts)
+            self._take(identity, parts, now_s)
 
     def close(self) -> None:
         """Closes the socket; may be called twice."""
         self._listener.close()
 
-    def _take(self, subscriber: bytes, parts: list[bytes]) -> None:
+    def _prune(self, now_s: float) -> None:
+        """Forgets those who have not renewed."""
+        self._prune_s = now_s + RENEW_S
+        lapsed = [key for key, one in self._subscribers.items() if now_s - one.heard_s >= LAPSE_S]
+        for identity in lapsed:
+            del self._subscribers[identity]
+
+    def _take(self, identity: bytes, parts: list[bytes], now_s: float) -> None:
         if len(parts) != 1:
             self.refusals.count("parts", f"{len(parts)} parts")
             return
@@ -123,24 +134,34 @@ class WeightsPublisher:
         except MessageError as error:
             self.refusals.count(error.fault, str(error))
             return
-        now_s = self._clock()
         if not isinstance(message, Subscription):
             self.refusals.count("unexpected", f"a {type(message).__name__} to a publisher")
-        elif subscriber not in self._heard_s and len(self._heard_s) >= MAX_SUBSCRIBERS:
+            return
+        if identity not in self._subscribers and len(self._subscribers) >= MAX_SUBSCRIBERS:
             self.refusals.count("flood", f"more than {MAX_SUBSCRIBERS} subscribers")
-        elif now_s - self._heard_s.get(subscriber, float("-inf")) >= LEAST_S:
-            self._heard_s[subscriber] = now_s
-            if (message.version, message.learner_step) != self._newest_is:
-                self._send(subscriber)
+            return
+        subscriber = self._subscribers.setdefault(identity, _Subscriber())
+        subscriber.heard_s = now_s
+        has_newest = (message.version, message.learner_step) == self._newest_is
+        if not has_newest and now_s - subscriber.sent_s >= REPEAT_S:
+            self._send(identity, subscriber, now_s)
 
-    def _send(self, subscriber: bytes) -> None:
+    def _send(self, identity: bytes, subscriber: _Subscriber, now_s: float) -> None:
         """Sends the newest weights, if there are any; a full queue drops them, and so does one who has left."""
         if self._newest is not None:
-            self._listener.socket.send_multipart([subscriber, self._newest], zmq.NOBLOCK, copy=False)
+            subscriber.sent_s = now_s
+            self._listener.socket.send_multipart([identity, self._newest], zmq.NOBLOCK, copy=False)
+
+
+class _Subscriber:
+    """When a subscriber was heard last, and when it was sent something."""
+
+    def __init__(self) -> None:
+        self.heard_s = self.sent_s = float("-inf")
 
 
 class WeightsSubscriber:
-    """An actor's or evaluator's end.
+    """An actor's end. It must be asked, or waited with, more often than every LAPSE_S, or it is forgotten meanwhile.
 
     Args:
         address: of the publisher.
@@ -179,7 +200,7 @@ class WeightsSubscriber:
         """Returns weights that came since the last call, the newest only, or None. Never waits.
 
         Raises:
-            TransportError: the publisher refused our keys.
+            TransportError: the publisher refused our keys, or the connection is given up.
         """
         self._connection.check()
         self._subscribe()
@@ -210,7 +231,11 @@ class WeightsSubscriber:
         self._renew_s = float("-inf")
 
     def wait(self, timeout_s: float) -> bool:
-        """Waits until something has come, up to `timeout_s`; returns whether it has."""
+        """Waits until something has come, up to `timeout_s`; returns whether it has.
+
+        Raises:
+            TransportError: the connection is given up.
+        """
         self._subscribe()
         return bool(self._connection.socket.poll(int(timeout_s * 1000)))
 
@@ -223,7 +248,13 @@ class WeightsSubscriber:
         now_s = self._clock()
         if now_s >= self._renew_s:
             self._renew_s = now_s + RENEW_S
-            self._connection.socket.send(encode(Subscription(*self._last), self._generation), zmq.NOBLOCK)
+            try:
+                self._connection.socket.send(encode(Subscription(*self._last), self._generation), zmq.NOBLOCK)
+            except zmq.Again:  # a DEALER that conflates has room as long as it has a connection, or makes one
+                raise TransportError(
+                    f"{self._connection.address}: the connection for weights was given up: "
+                    "they may be larger than transport.max_message_mb"
+                ) from None
 
     def _checked(self, message: object) -> Weights:
         if not isinstance(message, Weights):

@@ -35,7 +35,16 @@ from tests.cli.conftest import Command, Refused
             2,
             "replay.error_buffer 90 is too narrow, shared out over 2 servers",
         ),
-        (["train", "--set", "transport.max_message_mb=0.1"], 2, "less than the 0.83 MB"),
+        (
+            ["train", "--set", "transport.max_message_mb=0.1", "--set", "network.hidden=[8]"],
+            2,
+            "less than the 0.83 MB",
+        ),
+        (
+            ["train", "--set", "transport.max_message_mb=0.9"],
+            2,
+            "less than the 0.971 MB that weights of 250468 parameters",
+        ),
         (
             [
                 "evaluate",

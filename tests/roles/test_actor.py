@@ -57,6 +57,22 @@ class Flying:
             self.actor.step()
 
 
+def test_an_actor_that_is_held_back_keeps_saying_that_it_wants_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    with ExitStack() as stack:
+        flying = Flying(load(None, SMALL), stack)
+        flying.fly(1)
+        waits: list[float] = []
+
+        def wait(_: BoardReader, timeout_s: float) -> bool:
+            waits.append(timeout_s)
+            return False
+
+        monkeypatch.setattr(BoardReader, "wait", wait)
+        monkeypatch.setattr(StoreSink, "has_room", property(lambda _: False))
+        assert not flying.actor.is_ready(0.0)
+        assert waits == [0.0]
+
+
 def epsilons_of(flown_steps: int, steps: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The epsilons with which an actor chose its actions."""
     used: list[float] = []

@@ -14,12 +14,13 @@ import zmq
 from numpy.typing import NDArray
 
 from apex_bat.transport.messages import Subscription, Waiting, Weights, encode
-from apex_bat.transport.security import make_keys
+from apex_bat.transport.security import TransportError, make_keys
 from apex_bat.transport.sockets import Connection
 from apex_bat.transport.weights import (
     LAPSE_S,
     MAX_SUBSCRIPTION_BYTES,
     RENEW_S,
+    REPEAT_S,
     WeightsPublisher,
     WeightsSubscriber,
 )
@@ -57,6 +58,14 @@ def arrival(publisher: WeightsPublisher, subscriber: WeightsSubscriber) -> Weigh
     raise AssertionError("no weights came")
 
 
+def until(publisher: WeightsPublisher, is_so: Callable[[], bool]) -> None:
+    """Serves the publisher until something is so."""
+    ends_s = time.monotonic() + 10
+    while not is_so():
+        assert time.monotonic() < ends_s
+        publisher.serve()
+
+
 def test_a_late_subscriber_gets_the_newest_at_once(publisher: WeightsPublisher) -> None:
     for version in range(3):
         publisher.publish(version, version * 25, arrays(version))
@@ -80,10 +89,10 @@ def test_a_slow_subscriber_finds_the_newest_even_if_a_full_queue_dropped_it() ->
         arrival(publisher, subscriber)
         for version in range(1, 100):  # faster than any queue is emptied
             publisher.publish(version, version, arrays(version))
-        now[0] = RENEW_S
+        now[0] = REPEAT_S
         seen = [arrival(publisher, subscriber).version]
         while seen[-1] < 99:
-            now[0] += RENEW_S
+            now[0] += REPEAT_S
             seen.append(arrival(publisher, subscriber).version)
         assert len(seen) < 99
         assert seen == sorted(seen)
@@ -92,18 +101,57 @@ def test_a_slow_subscriber_finds_the_newest_even_if_a_full_queue_dropped_it() ->
         publisher.close()
 
 
-def test_weights_sent_again_for_somebody_else_are_not_new(
-    publisher: WeightsPublisher, subscriber: WeightsSubscriber
-) -> None:
+def test_weights_that_come_twice_are_new_once(publisher: WeightsPublisher, subscriber: WeightsSubscriber) -> None:
     publisher.publish(1, 1, arrays(1))
     arrival(publisher, subscriber)
-    other = WeightsSubscriber(publisher.address)
+    [(identity, known)] = publisher._subscribers.items()
+    publisher._send(identity, known, 0.0)
+    assert subscriber.wait(10.0)
+    assert subscriber.newest() is None
+
+
+def test_who_has_the_newest_is_sent_nothing_and_who_missed_them_gets_them_with_a_renewal() -> None:
+    now = [0.0]
+    publisher = WeightsPublisher("tcp://127.0.0.1:0", clock=lambda: now[0])
+    subscriber = WeightsSubscriber(publisher.address, clock=lambda: now[0])
     try:
-        arrival(publisher, other)
-        subscriber.wait(1.0)
-        assert subscriber.newest() is None
+        publisher.publish(1, 1, arrays(1))
+        arrival(publisher, subscriber)
+        [known] = publisher._subscribers.values()
+        now[0] = REPEAT_S
+        subscriber.newest()
+        until(publisher, lambda: known.heard_s == REPEAT_S)
+        assert known.sent_s == 0.0, "it has them"
+
+        publisher._newest_is = (2, 2)  # as if a full queue had dropped the next ones
+        now[0] = 2.0 * REPEAT_S
+        subscriber.newest()
+        until(publisher, lambda: known.heard_s == 2.0 * REPEAT_S)
+        assert known.sent_s == 2.0 * REPEAT_S
     finally:
-        other.close()
+        subscriber.close()
+        publisher.close()
+
+
+def test_whoever_says_so_in_time_finds_the_newest_however_seldom_it_looks() -> None:
+    now = [0.0]
+    publisher = WeightsPublisher("tcp://127.0.0.1:0", clock=lambda: now[0])
+    subscriber = WeightsSubscriber(publisher.address, clock=lambda: now[0])
+    try:
+        publisher.publish(0, 0, arrays(0))
+        arrival(publisher, subscriber)
+        [known] = publisher._subscribers.values()
+        for second in range(1, int(3.0 * LAPSE_S)):
+            now[0] = float(second)
+            subscriber.wait(0.0)
+            until(publisher, lambda: known.heard_s == now[0])
+            publisher.publish(second, second, arrays(second))
+        assert subscriber.wait(10.0)
+        newest = [weights.version for _ in range(50) if subscriber.wait(0.05) and (weights := subscriber.newest())]
+        assert newest[-1] == 3.0 * LAPSE_S - 1.0
+    finally:
+        subscriber.close()
+        publisher.close()
 
 
 def test_a_learner_resumed_at_a_lower_version_is_followed(
@@ -148,6 +196,23 @@ def test_weights_of_another_generation_are_refused(publisher: WeightsPublisher, 
     assert subscriber.refusals.counts == {"generation": 1}
 
 
+def test_a_subscriber_for_whom_weights_are_too_large_says_so(publisher: WeightsPublisher) -> None:
+    now = [0.0]
+    subscriber = WeightsSubscriber(publisher.address, max_message_bytes=1000, clock=lambda: now[0])
+    try:
+        publisher.publish(1, 1, {"w": np.zeros(100_000, np.float32)})
+
+        def renew() -> bool:
+            now[0] += RENEW_S
+            subscriber.wait(0.01)
+            return False
+
+        with pytest.raises(TransportError, match="max_message_mb"):
+            until(publisher, renew)
+    finally:
+        subscriber.close()
+
+
 def test_arrays_in_any_memory_order_arrive_as_they_are(publisher: WeightsPublisher) -> None:
     turned = np.arange(12, dtype=np.float32).reshape(4, 3).T
     publisher.publish(1, 1, {"w": turned, "b": np.zeros(4, np.float32)})
@@ -170,14 +235,6 @@ def test_weights_travel_encrypted_to_those_with_keys(tmp_path: Path) -> None:
         friend.close()
         stranger.close()
         publisher.close()
-
-
-def until(publisher: WeightsPublisher, is_so: Callable[[], bool]) -> None:
-    """Serves the publisher until something is so."""
-    ends_s = time.monotonic() + 10
-    while not is_so():
-        assert time.monotonic() < ends_s
-        publisher.serve()
 
 
 def test_what_is_no_subscription_of_one_who_knows_the_generation_is_refused_and_counted() -> None:
@@ -303,9 +360,10 @@ def attack(address: str) -> None:
         topics.close()
 
 
-def test_a_subscriber_follows_a_publisher_to_another_address_and_generation(
-    publisher: WeightsPublisher, subscriber: WeightsSubscriber
+def test_a_subscriber_follows_a_publisher_to_another_address_and_generation_at_once(
+    publisher: WeightsPublisher,
 ) -> None:
+    subscriber = WeightsSubscriber(publisher.address, SHAPES, clock=lambda: 0.0)
     publisher.publish(1, 25, arrays(1))
     assert arrival(publisher, subscriber).version == 1
     successor = WeightsPublisher("tcp://127.0.0.1:0", generation=7)
@@ -318,3 +376,4 @@ def test_a_subscriber_follows_a_publisher_to_another_address_and_generation(
         assert arrival(successor, subscriber).version == 4
     finally:
         successor.close()
+        subscriber.close()

@@ -198,6 +198,7 @@ class Fleet:
         if isinstance(answer, LostError):
             if not kept.is_lost:
                 _log.warning("%s: its keeper is lost: %s", placed.role.name, answer)
+                kept.dismiss()  # it may only be out of reach
             kept.is_lost = True
             placed.take_loss(str(answer))
         elif isinstance(answer, Look):

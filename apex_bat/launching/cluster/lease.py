@@ -13,6 +13,8 @@ from collections.abc import Callable
 
 from apex_bat.roles.orders import ORPHANED_S
 
+YOUNG_S, IMPORTS_S = 30.0, 5.0
+"""How long ago a role may have been started that is still importing its libraries, and how long that may go on."""
 MARGIN_S = 0.5
 """What the launcher waits beyond: for the keeper's kill to be done, and for clocks that run unequally fast."""
 
@@ -63,8 +65,8 @@ class Hearing:
         """When it came; None before the first."""
         self.lost_s: float | None = None
         """When it was known that the keeper is gone; None while it is not."""
-        self.may_run = False
-        """Whether a role was ever ordered to start there: an order whose answer was an error may have come through."""
+        self.ordered_s: float | None = None
+        """When a role was last ordered to start there, even if the answer was an error; None: never."""
 
     def take(self, now_s: float, number: int | None = None) -> None:
         """Notes an answer: `number` if it is one to a look, None to another call, which prolongs no lease."""
@@ -81,11 +83,14 @@ class Hearing:
         """Returns from when on nothing runs there that was started by a keeper that is gone; infinite if it is not.
 
         A dead keeper enforces no lease. Its end is the end of its role's leash, which has ORPHANED_S for its last
-        files; and the keeper may have died just before that was known.
+        files; and the keeper may have died just before that was known. A young role hears of it after its imports.
         """
         if self.lost_s is None:
             return float("inf")
-        return self.lost_s + ORPHANED_S + MARGIN_S if self.may_run else self.lost_s
+        if self.ordered_s is None:
+            return self.lost_s
+        is_young = self.lost_s - self.ordered_s < YOUNG_S
+        return self.lost_s + ORPHANED_S + MARGIN_S + (IMPORTS_S if is_young else 0.0)
 
     def is_over(self, now_s: float) -> bool:
         """Whether the keeper's lease has ended for certain."""

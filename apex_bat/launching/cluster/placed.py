@@ -65,7 +65,7 @@ class Placed:
 
     def begin(self) -> None:
         """Notes that the order to start it has gone."""
-        self._is_started, self._hearing.may_run, self.waiting = True, True, ""
+        self._is_started, self._hearing.ordered_s, self.waiting = True, self._clock(), ""
 
     def take_start(self, pid: int) -> None:
         """Notes its process; 0: the keeper had not heard us for too long to start one."""

@@ -42,6 +42,7 @@ from apex_bat.launching.local import terminable
 from apex_bat.launching.standing import NEW_RUN, Origin
 from apex_bat.launching.status import STATUS, read_status
 from apex_bat.roles.logs import launcher_log
+from apex_bat.roles.orders import ORPHANED_S
 from apex_bat.roles.plan import Role, roles_of
 from apex_bat.roles.process import ADDRESSES
 from apex_bat.storage import StorageError, write_text
@@ -187,7 +188,7 @@ def _await_leases(config: Config, run: Path) -> None:
     except StorageError:  # of a new run there is none
         has_ended = not (run / STATUS).exists()
     if not has_ended:
-        wait_s = config.cluster.lease_s + MARGIN_S  # an orphan ends sooner
+        wait_s = config.cluster.lease_s + ORPHANED_S + MARGIN_S  # of a keeper that died just before its lease was over
         _log.warning("the former launcher did not end the run: waits %.0f s for what it may have left running", wait_s)
         time.sleep(wait_s)
 

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from apex_bat.launching.cluster.lease import MARGIN_S, Hearing, Lease, clock_s
+from apex_bat.launching.cluster.lease import IMPORTS_S, MARGIN_S, YOUNG_S, Hearing, Lease, clock_s
 from apex_bat.roles.orders import ORPHANED_S
 
 
@@ -100,8 +100,10 @@ def test_nothing_runs_on_a_lost_keeper_after_the_grace_of_what_was_started_there
     hearing.take_loss(100.0)
     hearing.take_loss(200.0)
     assert hearing.gone_s() == 100.0, "nothing was started"
-    hearing.may_run = True
+    hearing.ordered_s = 100.0 - YOUNG_S
     assert hearing.gone_s() == 100.0 + ORPHANED_S + MARGIN_S
+    hearing.ordered_s = 99.0
+    assert hearing.gone_s() == 100.0 + IMPORTS_S + ORPHANED_S + MARGIN_S, "it may still import its libraries"
 
 
 @pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no such clock")

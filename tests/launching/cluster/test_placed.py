@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from apex_bat.config import load
 from apex_bat.launching.cluster.keeper import Site
-from apex_bat.launching.cluster.lease import MARGIN_S, Hearing
+from apex_bat.launching.cluster.lease import IMPORTS_S, MARGIN_S, YOUNG_S, Hearing
 from apex_bat.launching.cluster.placed import Placed
 from apex_bat.roles.orders import ORPHANED_S
 from apex_bat.roles.plan import Role
@@ -26,9 +26,11 @@ class Clock:
 def placed_on(role: Role, clock: Clock) -> tuple[Placed, list[str]]:
     hearing, orders = Hearing(20.0), list[str]()
     placed = Placed(role, 1, "1 CPU", CONFIG, hearing, orders.append, clock)
+    clock.now_s = -YOUNG_S
     placed.take_site(Site("h", "10.0.0.1", 5000, ""))
     placed.begin()
     placed.take_start(7)
+    clock.now_s = 0.0
     hearing.take(0.0, 1)
     return placed, orders
 
@@ -66,8 +68,9 @@ def test_a_life_that_has_not_begun_waits_for_what_the_former_one_may_have_left_o
     hearing.take(0.0, 1)
     placed = Placed(LEARNER, 2, "1 CPU", CONFIG, hearing, lambda _: None, clock)
     placed.take_loss("it died")
-    assert placed.poll() is None
     clock.now_s = GONE_S
+    assert placed.poll() is None, "what was ordered just before the loss may still import its libraries"
+    clock.now_s = IMPORTS_S + GONE_S
     assert placed.poll() is not None
 
 

@@ -116,7 +116,7 @@ def test_what_a_former_launcher_may_have_left_running_is_waited_for(
     if status is not None:
         facts = {"launcher_pid": 1, "host": "elsewhere", "written_unix_s": 0.0, "roles": []}
         (tmp_path / "status.json").write_text(json.dumps(facts | status))
-    for lease_s, wait_s in ((20.0, 20.5), (2.0, 2.5)):
+    for lease_s, wait_s in ((20.0, 21.5), (2.0, 3.5)):
         module._await_leases(load(None, [f"cluster.lease_s={lease_s}"]), tmp_path)
         assert slept_s == ([wait_s] if waits else [])
         slept_s.clear()

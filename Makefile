@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup train test test-slow chaos lint clean
+.PHONY: setup train test test-slow chaos peers lint clean
 .DEFAULT_GOAL := train
 
 setup: $(VENV)/.installed
@@ -26,10 +26,18 @@ test-slow: setup
 chaos: setup
 	$(BIN)/python -m benchmarks.chaos
 
+# A virtual environment for each library of `python -m benchmarks.peers`: they need versions that exclude one another.
+peers: setup .peers/tianshou/.installed .peers/sb3/.installed .peers/rllib/.installed
+
+.peers/%/.installed: benchmarks/peers/requirements-%.txt
+	$(PYTHON) -m venv .peers/$*
+	.peers/$*/bin/pip install --quiet --disable-pip-version-check --no-deps --requirement $<
+	@touch $@
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 clean:
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) .peers build *.egg-info .mypy_cache .ruff_cache .pytest_cache

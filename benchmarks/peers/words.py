@@ -1,0 +1,45 @@
+"""The words of docs/results/peers.md that are no figures: rules, settings, causes, trials."""
+
+HEAD = """# apex_bat beside other libraries
+
+Made by `python -m benchmarks.peers` from measurements in one run on one machine, nothing else running, seeds
+interleaved: first every entry with seed 0, then every one with seed 1, and so on. The same bat learns to fly through
+the same arena, simple, in the condition memory, with the same network, settings and cores.
+
+- *The clock* begins with the command and counts everything: imports, start of workers, training. Policies are written
+  every 10 s and judged afterwards by one function for all, so judging costs nobody time. apex_bat runs as it ships:
+  its own evaluator, recordings and snapshots run beside its training and cost it time and memory.
+- *Judged* are the 15 flights of `apex-bat evaluate`: fixed starts, no exploration, 1000 steps. Every policy is judged
+  until one completes 14; that one's time is the result. After it one a minute is judged, and the last.
+- *The registered environment* is `apex_bat/EchoFlight-v0`, many bats in one world, for everybody. *The obvious
+  environment* is the same flight with PyBullet's rays and a 125 kHz chain in numpy and scipy, as one would write it at
+  first; the peers fly it in processes of their own, 8 bats. apex_bat has no such form: its figures stand beside.
+- Figures are medians over seeds, least and greatest in brackets. Steps and updates a second are from the first update
+  on. Memory is the greatest sum over all processes, shared pages counted once."""
+
+SETTINGS = """## Settings
+
+The same for all, from `configs/memory.toml` and the defaults: two convolutions of 16 and 32 channels and dueling
+streams of 128 units (Stable-Baselines3, without dueling: one stream of 256, as many parameters), inputs scaled by 4,
+batches of 64, discount 0.95, n = 3, replay of 200,000, first update after 2,000 steps, 8 samples per insert (one
+update for 8 steps), target copied every 500 updates, priorities with exponent 0.6 and importance weights from 0.4,
+RMSprop with 0.00025, gradients clipped at 40.
+
+What differs, because a library has it so:
+
+| | differs |
+|---|---|
+| apex_bat | 32 bats in two processes, each with an epsilon of its own (Ape-X); half of each batch mirrored |
+| all peers | one epsilon for all bats, from 1.0 to 0.05 over 20,000 steps; 16 bats |
+| Tianshou | new transitions get the greatest priority so far |
+| Stable-Baselines3 | uniform replay, no double Q-learning, Huber loss; one draw decides whether all bats explore |
+| RLlib | importance weights stay at 0.4; new transitions get the greatest priority so far |
+| RLlib | 7 to 8 samples per insert: a round of sampling is longer where episodes end |
+"""
+
+CAUSES = """## Where the time goes
+"""
+
+TRIALS = """Short trainings by which the peers' settings were chosen. They ran beside other work: times and rates are
+not to be compared with those above, steps are.
+"""

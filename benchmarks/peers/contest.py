@@ -25,7 +25,7 @@ import numpy as np
 from apex_bat.launching import ONE_THREAD
 from apex_bat.storage import write_text
 from benchmarks.peers import apex_bat_entry, notebook
-from benchmarks.peers.judging import judge_course, judges
+from benchmarks.peers.judging import Judgement, judge_course, judges
 from benchmarks.peers.notebook import Row
 from benchmarks.peers.process_tree import ProcessTree, Sample
 from benchmarks.peers.terms import ENOUGH, ROOT, Entry, Environment, terms
@@ -138,8 +138,8 @@ def run(start: Start, options: Options) -> Result:
     together = os.cpu_count() or 1
     files = {row.wall_s: folder / row.policy for row in rows if row.policy}
     with judges(terms(), together) as judge_all:
-        completed = judge_course(files, ENOUGH, LATER_S, judge_all, together)
-    result = result_of(start, options, rows, samples, completed, _versions(start.entry, folder))
+        judged = judge_course(files, ENOUGH, LATER_S, judge_all, together)
+    result = result_of(start, options, rows, samples, judged, _versions(start.entry, folder))
     if not options.is_kept:
         shutil.rmtree(folder)
     return result
@@ -150,7 +150,7 @@ def result_of(
     options: Options,
     rows: Sequence[Row],
     samples: Sequence[Sample],
-    completed: dict[float, int],
+    judged: dict[float, Judgement],
     versions: dict[str, str],
 ) -> Result:
     """Returns the figures of a training, ready for JSON: `report` tells what they are."""
@@ -179,7 +179,8 @@ def result_of(
                 "env_steps": row.env_steps,
                 "updates": row.updates,
                 "cpu_s": round(float(np.interp(row.wall_s, walls_s, cpus_s)), 2),
-                "completed": completed.get(row.wall_s),
+                "completed": judged[row.wall_s].completed if row.wall_s in judged else None,
+                "progress_m": round(judged[row.wall_s].progress_m, 1) if row.wall_s in judged else None,
             }
             for row in rows
             if row.policy

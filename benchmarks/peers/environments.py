@@ -116,7 +116,7 @@ class ObviousFlight(EchoFlight):
         """Returns the frame of both ears, (1, 2, 24)."""
         yardstick, heard_m = self._yardstick, range_m[0].astype(np.float64)
         heard = np.stack([yardstick._hear(heard_m, gain_db) for gain_db in yardstick._gain_db])
-        return np.asarray(heard[None], np.float32)
+        return cast("Flat", heard[None].astype(np.float32))
 
 
 def _settings(config: Config) -> dict[str, Any]:
@@ -144,7 +144,7 @@ class Swarm:
             mask[:] = False
             mask[np.asarray(rows)] = True
         flat, _ = self.env.reset(seed=seed, options={"reset_mask": mask})
-        return flat[mask]
+        return np.asarray(flat[mask], np.float32)
 
     def step(
         self, actions: NDArray[np.int64]

@@ -59,6 +59,10 @@ def draw(all_groups: Sequence[Group], path: Path) -> None:
         plain(axes, f"{environment} environment", "wall-clock time since the command [s]",
               f"flights completed, of {NUM_FLIGHTS}" if panel == 0 else "")  # fmt: skip
         axes.title.set_fontsize(NORMAL)
-        if panel == 0:
-            axes.legend(fontsize=SMALL, frameon=False, loc="lower right")
+    handles = {
+        str(line.get_label()): line for axes in figure.axes for line in axes.lines if line.get_marker() != "None"
+    }
+    figure.legend(
+        list(handles.values()), list(handles), fontsize=SMALL, frameon=False, loc="outside upper center", ncols=6
+    )
     figure.savefig(path, dpi=2 * PNG_DPI, metadata={"Software": None})

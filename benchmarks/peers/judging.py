@@ -7,6 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -19,8 +20,17 @@ from apex_bat.roles import checkpoint
 Parameters = Mapping[str, NDArray[np.float32]]
 
 
-def judge(parameters: Parameters, config: Config) -> int:
-    """Returns how many flights a policy completes.
+class Judgement(NamedTuple):
+    """What the flights of a policy came to."""
+
+    completed: int
+    """Flights of 1000 steps that touched no wall."""
+    progress_m: float
+    """Mean net way along the corridor: a bat that circles on the spot completes flights, too, but makes none."""
+
+
+def judge(parameters: Parameters, config: Config) -> Judgement:
+    """Returns how many flights a policy completes, and how far it comes.
 
     Args:
         parameters: by the names of `apex_bat.agent.inference`; the dense layers may have other widths.
@@ -33,11 +43,12 @@ def judge(parameters: Parameters, config: Config) -> int:
     records, _ = fly(
         policy, config, config.arena, num_flights=config.evaluation.flights, seed=config.evaluation.start_seed
     )
-    return sum(record.completed for record in records)
+    progress_m = sum(record.progress_m for record in records) / len(records)
+    return Judgement(sum(record.completed for record in records), progress_m)
 
 
 @contextmanager
-def judges(config: Config, processes: int) -> Iterator[Callable[[Sequence[Path]], list[int]]]:
+def judges(config: Config, processes: int) -> Iterator[Callable[[Sequence[Path]], list[Judgement]]]:
     """Gives what judges the policies in some files, by several processes at once."""
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
         yield lambda paths: list(pool.map(_judge_file, paths, [config] * len(paths)))
@@ -47,10 +58,10 @@ def judge_course(
     files: Mapping[float, Path],
     enough: int,
     later_s: float,
-    judge_all: Callable[[Sequence[Path]], Sequence[int]],
+    judge_all: Callable[[Sequence[Path]], Sequence[Judgement]],
     together: int,
-) -> dict[float, int]:
-    """Returns how many flights were completed by the policies of a training, by their times.
+) -> dict[float, Judgement]:
+    """Returns how the policies of a training were judged, by their times.
 
     Every policy is judged until one completes enough, which is what the contest asks for; of those after it only one
     in a while, and the last, for a judgement of good policies takes several seconds.
@@ -62,9 +73,9 @@ def judge_course(
         judge_all: judges some files.
         together: how many are judged at once.
     """
-    times, judged = list(files), dict[float, int]()
+    times, judged = list(files), dict[float, Judgement]()
     waiting = times
-    while waiting and max(judged.values(), default=0) < enough:
+    while waiting and max((each.completed for each in judged.values()), default=0) < enough:
         some, waiting = waiting[:together], waiting[together:]
         judged |= zip(some, judge_all([files[time_s] for time_s in some]), strict=True)
     chosen: list[float] = []
@@ -89,5 +100,5 @@ def fitting(network: settings.Network, parameters: Parameters) -> settings.Netwo
     return msgspec.structs.replace(network, hidden=widths)
 
 
-def _judge_file(path: Path, config: Config) -> int:
+def _judge_file(path: Path, config: Config) -> Judgement:
     return judge(parameters_in(path), config)

@@ -10,7 +10,9 @@ the same arena, simple, in the condition memory, with the same network, settings
   every 10 s and judged afterwards by one function for all, so judging costs nobody time. apex_bat runs as it ships:
   its own evaluator, recordings and snapshots run beside its training and cost it time and memory.
 - *Judged* are the 15 flights of `apex-bat evaluate`: fixed starts, no exploration, 1000 steps. Every policy is judged
-  until one completes 14; that one's time is the result. After it one a minute is judged, and the last.
+  until one completes 14; that one's time is the result. After it one a minute is judged, and the last. Progress is the
+  mean net way of its flights along the corridor, of at most some 165 m: a bat that circles on the spot completes
+  flights, too, but makes none.
 - *The registered environment* is `apex_bat/EchoFlight-v0`, many bats in one world, for everybody. *The obvious
   environment* is the same flight with PyBullet's rays and a 125 kHz chain in numpy and scipy, as one would write it at
   first; the peers fly it in processes of their own, 8 bats. apex_bat has no such form: its figures stand beside.

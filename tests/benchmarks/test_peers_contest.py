@@ -13,6 +13,7 @@ from apex_bat.config import load
 from apex_bat.roles import checkpoint
 from benchmarks.peers import apex_bat_entry, contest
 from benchmarks.peers.contest import Options, PeerError, Start, hold, result_of, starts
+from benchmarks.peers.judging import Judgement
 from benchmarks.peers.notebook import Row
 from benchmarks.peers.process_tree import ProcessTree, Sample
 from benchmarks.peers.terms import ABLATIONS, ENTRIES, entry_of, epsilon_at, terms, updates_of
@@ -61,7 +62,9 @@ def test_what_is_done_is_not_run_again_and_a_failure_stops_nobody_else(
 def made_up(start: Start, given: Options) -> dict[str, Any]:
     rows = [Row(3.0, 0, 0), Row(10.0, 1000, 0, "a"), Row(20.0, 3000, 100, "b"), Row(40.0, 9000, 700, "c")]
     samples = [Sample(0.0, 0.0, 100.0), Sample(20.0, 30.0, 500.0), Sample(40.0, 50.0, 400.0)]
-    return result_of(start, given, rows, samples, {10.0: 0, 20.0: 14}, {"numpy": "2"})
+    return result_of(
+        start, given, rows, samples, {10.0: Judgement(0, 3.04), 20.0: Judgement(14, 150.0)}, {"numpy": "2"}
+    )
 
 
 def test_rates_are_of_the_time_in_which_it_learns_and_cpu_time_is_that_of_each_moment(tmp_path: Path) -> None:
@@ -72,6 +75,7 @@ def test_rates_are_of_the_time_in_which_it_learns_and_cpu_time_is_that_of_each_m
     assert result["start_s"] == 3.0
     assert [point["cpu_s"] for point in result["curve"]] == [15.0, 30.0, 50.0]
     assert [point["completed"] for point in result["curve"]] == [0, 14, None]
+    assert [point["progress_m"] for point in result["curve"]] == [3.0, 150.0, None]
     assert json.loads(json.dumps(result)) == result
 
 
@@ -86,22 +90,20 @@ def test_an_unknown_entry_is_named_beside_those_there_are() -> None:
         entry_of("acme")
 
 
-def test_a_tree_counts_children_and_what_they_used_after_they_ended(tmp_path: Path) -> None:
-    """The parent starts a child that computes, and ends when it is told to by a file."""
-    go = tmp_path / "go"
+def test_a_tree_counts_children_and_what_they_used_after_they_ended() -> None:
+    """The parent starts a child that computes, and itself only waits until its input ends."""
     child = "import time\nwhile time.process_time() < 0.5: pass\n"
     parent = (
-        f"import pathlib, subprocess, sys, time\nchild = subprocess.Popen([sys.executable, '-c', {child!r}])\n"
-        f"while not pathlib.Path({str(go)!r}).exists(): time.sleep(0.01)\nchild.wait()\n"
+        f"import subprocess, sys\nchild = subprocess.Popen([sys.executable, '-c', {child!r}], stdin=-3)  # no input\n"
+        "sys.stdin.read()\nchild.wait()\n"
     )
-    with subprocess.Popen([sys.executable, "-c", parent]) as process:
+    with subprocess.Popen([sys.executable, "-c", parent], stdin=subprocess.PIPE) as process:
         tree = ProcessTree(process.pid)
         deadline_s = time.monotonic() + 60.0
         while tree.look(0.0).cpu_s < 0.4 and time.monotonic() < deadline_s:
             time.sleep(0.01)
         assert tree.samples[-1].memory_mb > 5.0
-        go.touch()
-        process.wait(60.0)
+        process.communicate(timeout=60.0)
     assert tree.look(1.0).cpu_s >= 0.4
     assert tree.samples[-1].memory_mb == 0.0
     tree.end(0.0)

@@ -12,7 +12,7 @@ from apex_bat.config import Config, load
 from apex_bat.evaluation import runs
 from apex_bat.roles import checkpoint
 from apex_bat.roles.checkpoint import Checkpoint
-from benchmarks.peers.judging import fitting, judge, judge_course, parameters_in
+from benchmarks.peers.judging import Judgement, fitting, judge, judge_course, parameters_in
 
 CONFIG = load(None, ["evaluation.flights=6", "episode.evaluation_steps=12"])
 
@@ -31,8 +31,9 @@ def test_as_many_flights_are_completed_as_evaluate_says(tmp_path: Path) -> None:
     result, _ = runs.evaluate(
         tmp_path, [CONFIG.arena], CONFIG.evaluation.flights, CONFIG.evaluation.start_seed, path=path
     )
-    completed = judge(parameters, CONFIG)
+    completed, progress_m = judge(parameters, CONFIG)
     assert completed == result["summary"][0]["completed"]
+    assert progress_m == pytest.approx(result["summary"][0]["progress_m_mean"])
     assert 0 < completed < CONFIG.evaluation.flights, "or the test says nothing"
     found = parameters_in(path)
     assert found.keys() == parameters.keys()
@@ -58,10 +59,10 @@ def test_all_policies_are_judged_until_one_completes_enough_and_then_a_few(
 ) -> None:
     files = {10.0 * (number + 1): Path(str(number)) for number in range(len(completed))}
 
-    def judge_all(paths: Sequence[Path]) -> list[int]:
-        return [completed[int(path.name)] for path in paths]
+    def judge_all(paths: Sequence[Path]) -> list[Judgement]:
+        return [Judgement(completed[int(path.name)], 1.0) for path in paths]
 
     judged = judge_course(files, 14, 30.0, judge_all, together=2)
-    assert list(judged.values()) == expected
+    assert [each.completed for each in judged.values()] == expected
     assert list(judged) == sorted(judged)
-    assert all(completed[int(files[time_s].name)] == number for time_s, number in judged.items())
+    assert all(completed[int(files[time_s].name)] == each.completed for time_s, each in judged.items())

@@ -38,7 +38,8 @@ def main() -> None:
     for name in sys.stdin.read().split(_END):
         try:
             reader = RrdReaderInternal(name)
-            reader.stream().to_chunks()
+            for chunk in reader.stream().to_chunks():
+                chunk.to_record_batch()  # a zero in the name of a column ends the process only here
             reader.store()
         except Exception as error:
             print("refused", type(error).__name__, flush=True)  # noqa: T201  # a line for who started us

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun as rr
 
 from apex_bat.config import settings
 from apex_bat.recording.episodes import write_flight
 from apex_bat.recording.flight import Flight
 from apex_bat.recording.hearing import Directions
+from apex_bat.recording.probing import undecodable
 from apex_bat.recording.reading import RecordingError, read_flight, read_settings
 from apex_bat.simulation.layout import Arena
 
@@ -79,3 +81,15 @@ def _assert_equal(one: Flight, other: Flight) -> None:
             np.testing.assert_array_equal(left, right, err_msg=field.name)
         else:
             assert left == right, field.name
+
+
+def test_a_zero_in_the_name_of_a_column_ends_another_process_and_not_this_one(tmp_path: Path) -> None:
+    path = tmp_path / "flight.rrd"
+    recording = rr.RecordingStream("damaged")
+    recording.save(path)
+    recording.log("policy/q", rr.AnyValues(**{"labels\0\0colors": [1.0]}))
+    recording.flush()
+    recording.disconnect()
+    assert undecodable([path]) == [path]
+    with pytest.raises(RecordingError, match=r"flight\.rrd"):
+        read_flight(path)

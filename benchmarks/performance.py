@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
-PARTS = ("simulation", "replay", "wire", "learner", "system", "recording")
+PARTS = ("simulation", "replay", "snapshot", "wire", "learner", "system", "recording")
 
 
 class Target(NamedTuple):
@@ -41,6 +41,7 @@ TARGETS: tuple[Target, ...] = (
     *_replay_targets(),
     Target("sample 512 of 1,000,000, in cpprb's time", "replay.sample_512.cap_1000000.ratio_to_cpprb", 0.75, False),
     Target("memory of 1,000,000 transitions [MB]", "replay.resident_mb.cap_1000000", 600, False),
+    Target("longest turn of a server while it writes a snapshot of them [ms]", "snapshot.longest_turn_ms", 100, False),
     Target("server saturated by 4 actors and a learner: inserted/s", "wire.server.inserted_per_s", 100_000, True),
     Target("batches of 512 a second from the same server meanwhile", "wire.server.batches_512_per_s", 500, True),
     Target("insert of 50, acknowledged, 99th percentile [ms]", "wire.insert_50.p99_ms", 2, False),

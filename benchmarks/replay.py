@@ -69,7 +69,7 @@ def synthetic_chunk(generator: np.random.Generator, transitions: int = 50) -> Ch
 
 def _of_capacity(capacity: int) -> list[Record]:
     end = f"cap_{capacity}"
-    ours, theirs = _Ours(capacity), _cpprb(capacity)
+    ours, theirs = Filled(capacity), _cpprb(capacity)
     records: list[Record] = []
     for name, size in (("insert", INSERT), *((name, size) for size in BATCHES for name in ("sample", "update"))):
         operations = [getattr(ours, name)(size)]
@@ -96,7 +96,7 @@ def _cpu_us(operations: list[Callable[[], object]]) -> list[list[float]]:
     return times
 
 
-class _Ours:
+class Filled:
     """A full buffer and the operations on it; each method returns one that is ready to be timed."""
 
     def __init__(self, capacity: int) -> None:
@@ -107,6 +107,7 @@ class _Ours:
             insert()
 
     def insert(self, size: int) -> Callable[[], object]:
+        """Returns what inserts so many transitions."""
         chunks = cycle([synthetic_chunk(self.generator, size) for _ in range(RUNS)])
         return lambda: self._add(next(chunks))
 
@@ -114,9 +115,11 @@ class _Ours:
         self.buffer.add([chunk], chunk.priorities + np.float32(0.001), 0, 0)
 
     def sample(self, size: int) -> Callable[[], object]:
+        """Returns what draws so many."""
         return lambda: self.buffer.sample(size, 0.4, self.generator)
 
     def update(self, size: int) -> Callable[[], object]:
+        """Returns what gives so many new priorities."""
         drawn = cycle([self.buffer.sample(size, 0.4, self.generator).batch.items for _ in range(RUNS)])
         errors = self.generator.random(size, dtype=np.float32) + np.float32(0.001)
         return lambda: self.buffer.update(next(drawn), errors)
@@ -154,9 +157,11 @@ class _Cpprb:
         }
 
     def sample(self, size: int) -> Callable[[], object]:
+        """Returns what draws so many."""
         return lambda: self.buffer.sample(size, beta=0.4)
 
     def update(self, size: int) -> Callable[[], object]:
+        """Returns what gives so many new priorities."""
         drawn = cycle([self.buffer.sample(size, beta=0.4)["indexes"] for _ in range(RUNS)])
         priorities = self.generator.random(size)
         return lambda: self.buffer.update_priorities(next(drawn), priorities)

@@ -109,7 +109,8 @@ def bench(
     part: Annotated[
         str,
         typer.Argument(
-            help="What to measure: simulation, replay, wire, recording, learner, system, scaling, or all but scaling."
+            help="What to measure: simulation, replay, snapshot, wire, recording, learner, system, scaling, or all but "
+            "scaling."
         ),
     ],
     json_file: Json = None,

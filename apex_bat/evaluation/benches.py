@@ -9,7 +9,7 @@ from typing import Any
 
 from apex_bat.config import ConfigError
 
-PARTS = ("simulation", "replay", "wire", "recording", "learner", "system", "scaling")
+PARTS = ("simulation", "replay", "snapshot", "wire", "recording", "learner", "system", "scaling")
 LONG = "scaling"
 """Not part of `all`: it takes five minutes of whole runs."""
 _CHECKOUT = Path(__file__).resolve().parents[2]

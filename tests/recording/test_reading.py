@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,7 +88,8 @@ def test_a_zero_in_the_name_of_a_column_ends_another_process_and_not_this_one(tm
     path = tmp_path / "flight.rrd"
     recording = rr.RecordingStream("damaged")
     recording.save(path)
-    recording.log("policy/q", rr.AnyValues(**{"labels\0\0colors": [1.0]}))
+    named: dict[str, Any] = {"labels\0\0colors": [1.0]}
+    recording.log("policy/q", rr.AnyValues(**named))
     recording.flush()
     recording.disconnect()
     assert undecodable([path]) == [path]

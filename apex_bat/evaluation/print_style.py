@@ -20,7 +20,7 @@ class Look(NamedTuple):
     """How a condition is drawn wherever it appears."""
 
     colour: str
-    dashes: str
+    dashes: str | tuple[float, tuple[float, ...]]
     hatch: str
 
 

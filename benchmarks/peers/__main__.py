@@ -23,7 +23,7 @@ from apex_bat.launching import ONE_THREAD
 from benchmarks.peers.contest import Options, hold, starts
 from benchmarks.peers.report import TRIALS_SUFFIX as TRIALS
 from benchmarks.peers.report import write
-from benchmarks.peers.terms import ENTRIES, ENVIRONMENTS, entry_of
+from benchmarks.peers.terms import ENTRIES, ENVIRONMENTS, Environment, entry_of
 
 
 def main() -> int:
@@ -42,8 +42,11 @@ def main() -> int:
     given = parser.parse_args()
     entries = [entry_of(name) for name in given.only.split(",")] if given.only else list(ENTRIES)
     environments = [name for name in ENVIRONMENTS if name in given.environments.split(",")]
-    budgets_s = {"registered": given.budget_s, "obvious": given.obvious_budget_s or given.budget_s}
-    options = Options(given.file, budgets_s, given.every_s, tuple(given.overrides), given.keep)  # type: ignore[arg-type]
+    budgets_s: dict[Environment, float] = {
+        "registered": given.budget_s,
+        "obvious": given.obvious_budget_s or given.budget_s,
+    }
+    options = Options(given.file, budgets_s, given.every_s, tuple(given.overrides), given.keep)
     for name in ONE_THREAD:  # in the processes that judge: idle BLAS threads that spin halve the simulation's rate
         os.environ.setdefault(name, "1")
     has_failed = False

@@ -127,7 +127,8 @@ class SwarmVectorEnv(BaseVectorEnv):
 
     def __init__(self, swarm: Swarm, seed: int) -> None:
         # The base class would make a worker for each bat; what the collector uses of it is all here.
-        self._swarm, self._seed = swarm, seed
+        self._swarm = swarm
+        self._seed: int | None = seed  # for the first reset
         self.env_num, self.is_async, self.is_closed = swarm.num_bats, False, False
 
     def get_env_attr(self, key: str, id: Any = None) -> list[Any]:  # noqa: A002  # Tianshou's name
@@ -139,7 +140,7 @@ class SwarmVectorEnv(BaseVectorEnv):
     def reset(self, env_id: Any = None, **_: Any) -> tuple[NDArray[np.float32], NDArray[Any]]:
         """Begins the episodes of some bats, or of all."""
         rows = np.arange(self.env_num) if env_id is None else np.atleast_1d(env_id)
-        seed, self._seed = self._seed, None  # type: ignore[assignment]
+        seed, self._seed = self._seed, None
         return self._swarm.reset(rows, seed), np.array([{} for _ in rows])
 
     def step(self, action: Any, id: Any = None) -> Any:  # noqa: A002  # Tianshou's name

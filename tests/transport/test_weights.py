@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -47,6 +48,24 @@ def subscriber(publisher: WeightsPublisher) -> Iterator[WeightsSubscriber]:
     one.close()
 
 
+class Timed(NamedTuple):
+    """Both ends, by a clock that shows what the test says."""
+
+    now: list[float]
+    publisher: WeightsPublisher
+    subscriber: WeightsSubscriber
+
+
+@pytest.fixture
+def timed() -> Iterator[Timed]:
+    now = [0.0]
+    publisher = WeightsPublisher("tcp://127.0.0.1:0", clock=lambda: now[0])
+    subscriber = WeightsSubscriber(publisher.address, clock=lambda: now[0])
+    yield Timed(now, publisher, subscriber)
+    subscriber.close()
+    publisher.close()
+
+
 def arrival(publisher: WeightsPublisher, subscriber: WeightsSubscriber) -> Weights:
     """Returns the next weights that arrive, while the publisher is served."""
     ends_s = time.monotonic() + 10
@@ -80,25 +99,19 @@ def test_a_late_subscriber_gets_the_newest_at_once(publisher: WeightsPublisher) 
             late.close()
 
 
-def test_a_slow_subscriber_finds_the_newest_even_if_a_full_queue_dropped_it() -> None:
-    now = [0.0]
-    publisher = WeightsPublisher("tcp://127.0.0.1:0", clock=lambda: now[0])
-    subscriber = WeightsSubscriber(publisher.address, clock=lambda: now[0])
-    try:
-        publisher.publish(0, 0, arrays(0))
-        arrival(publisher, subscriber)
-        for version in range(1, 100):  # faster than any queue is emptied
-            publisher.publish(version, version, arrays(version))
-        now[0] = REPEAT_S
-        seen = [arrival(publisher, subscriber).version]
-        while seen[-1] < 99:
-            now[0] += REPEAT_S
-            seen.append(arrival(publisher, subscriber).version)
-        assert len(seen) < 99
-        assert seen == sorted(seen)
-    finally:
-        subscriber.close()
-        publisher.close()
+def test_a_slow_subscriber_finds_the_newest_even_if_a_full_queue_dropped_it(timed: Timed) -> None:
+    now, publisher, subscriber = timed
+    publisher.publish(0, 0, arrays(0))
+    arrival(publisher, subscriber)
+    for version in range(1, 100):  # faster than any queue is emptied
+        publisher.publish(version, version, arrays(version))
+    now[0] = REPEAT_S
+    seen = [arrival(publisher, subscriber).version]
+    while seen[-1] < 99:
+        now[0] += REPEAT_S
+        seen.append(arrival(publisher, subscriber).version)
+    assert len(seen) < 99
+    assert seen == sorted(seen)
 
 
 def test_weights_that_come_twice_are_new_once(publisher: WeightsPublisher, subscriber: WeightsSubscriber) -> None:
@@ -110,48 +123,36 @@ def test_weights_that_come_twice_are_new_once(publisher: WeightsPublisher, subsc
     assert subscriber.newest() is None
 
 
-def test_who_has_the_newest_is_sent_nothing_and_who_missed_them_gets_them_with_a_renewal() -> None:
-    now = [0.0]
-    publisher = WeightsPublisher("tcp://127.0.0.1:0", clock=lambda: now[0])
-    subscriber = WeightsSubscriber(publisher.address, clock=lambda: now[0])
-    try:
-        publisher.publish(1, 1, arrays(1))
-        arrival(publisher, subscriber)
-        [known] = publisher._subscribers.values()
-        now[0] = REPEAT_S
-        subscriber.newest()
-        until(publisher, lambda: known.heard_s == REPEAT_S)
-        assert known.sent_s == 0.0, "it has them"
+def test_who_has_the_newest_is_sent_nothing_and_who_missed_them_gets_them_with_a_renewal(timed: Timed) -> None:
+    now, publisher, subscriber = timed
+    publisher.publish(1, 1, arrays(1))
+    arrival(publisher, subscriber)
+    [known] = publisher._subscribers.values()
+    now[0] = REPEAT_S
+    subscriber.newest()
+    until(publisher, lambda: known.heard_s == REPEAT_S)
+    assert known.sent_s == 0.0, "it has them"
 
-        publisher._newest_is = (2, 2)  # as if a full queue had dropped the next ones
-        now[0] = 2.0 * REPEAT_S
-        subscriber.newest()
-        until(publisher, lambda: known.heard_s == 2.0 * REPEAT_S)
-        assert known.sent_s == 2.0 * REPEAT_S
-    finally:
-        subscriber.close()
-        publisher.close()
+    publisher._newest_is = (2, 2)  # as if a full queue had dropped the next ones
+    now[0] = 2.0 * REPEAT_S
+    subscriber.newest()
+    until(publisher, lambda: known.heard_s == 2.0 * REPEAT_S)
+    assert known.sent_s == 2.0 * REPEAT_S
 
 
-def test_whoever_says_so_in_time_finds_the_newest_however_seldom_it_looks() -> None:
-    now = [0.0]
-    publisher = WeightsPublisher("tcp://127.0.0.1:0", clock=lambda: now[0])
-    subscriber = WeightsSubscriber(publisher.address, clock=lambda: now[0])
-    try:
-        publisher.publish(0, 0, arrays(0))
-        arrival(publisher, subscriber)
-        [known] = publisher._subscribers.values()
-        for second in range(1, int(3.0 * LAPSE_S)):
-            now[0] = float(second)
-            subscriber.wait(0.0)
-            until(publisher, lambda: known.heard_s == now[0])
-            publisher.publish(second, second, arrays(second))
-        assert subscriber.wait(10.0)
-        newest = [weights.version for _ in range(50) if subscriber.wait(0.05) and (weights := subscriber.newest())]
-        assert newest[-1] == 3.0 * LAPSE_S - 1.0
-    finally:
-        subscriber.close()
-        publisher.close()
+def test_whoever_says_so_in_time_finds_the_newest_however_seldom_it_looks(timed: Timed) -> None:
+    now, publisher, subscriber = timed
+    publisher.publish(0, 0, arrays(0))
+    arrival(publisher, subscriber)
+    [known] = publisher._subscribers.values()
+    for second in range(1, int(3.0 * LAPSE_S)):
+        now[0] = float(second)
+        subscriber.wait(0.0)
+        until(publisher, lambda: known.heard_s == now[0])
+        publisher.publish(second, second, arrays(second))
+    assert subscriber.wait(10.0)
+    newest = [weights.version for _ in range(50) if subscriber.wait(0.05) and (weights := subscriber.newest())]
+    assert newest[-1] == 3.0 * LAPSE_S - 1.0
 
 
 def test_a_learner_resumed_at_a_lower_version_is_followed(
@@ -274,21 +275,15 @@ def test_who_subscribes_all_the_time_does_not_multiply_the_broadcasts() -> None:
         publisher.close()
 
 
-def test_who_does_not_renew_is_forgotten_and_gets_the_newest_when_it_returns() -> None:
-    now = [0.0]
-    publisher = WeightsPublisher("tcp://127.0.0.1:0", clock=lambda: now[0])
-    subscriber = WeightsSubscriber(publisher.address, clock=lambda: now[0])
-    try:
-        publisher.publish(1, 1, arrays(1))
-        assert arrival(publisher, subscriber).version == 1
-        now[0] = LAPSE_S + 1.0
-        publisher.publish(2, 2, arrays(2))
-        assert publisher.num_subscribers == 0
-        assert arrival(publisher, subscriber).version == 2
-        assert publisher.num_subscribers == 1
-    finally:
-        subscriber.close()
-        publisher.close()
+def test_who_does_not_renew_is_forgotten_and_gets_the_newest_when_it_returns(timed: Timed) -> None:
+    now, publisher, subscriber = timed
+    publisher.publish(1, 1, arrays(1))
+    assert arrival(publisher, subscriber).version == 1
+    now[0] = LAPSE_S + 1.0
+    publisher.publish(2, 2, arrays(2))
+    assert publisher.num_subscribers == 0
+    assert arrival(publisher, subscriber).version == 2
+    assert publisher.num_subscribers == 1
 
 
 def test_more_subscribers_than_are_taken_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,11 +2,14 @@
 
 Ingredients: dueling streams (Wang et al. 2016), double Q-learning (van Hasselt et al. 2016), prioritized replay with
 importance weights (Schaul et al. 2016), n-step targets, (centred) RMSprop and a clipped gradient (Horgan et al. 2018).
+The policy that is handed out is an average of the online network (Polyak & Juditsky 1992; of deep networks, Izmailov et
+al. 2018): single updates still change what is done in rare states when all common ones are learnt.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -20,6 +23,8 @@ from apex_bat.agent.mirror import mirror_batch
 from apex_bat.agent.network import DuelingNetwork, Values, load_parameters, parameters_of
 from apex_bat.config import Config, settings
 from apex_bat.experience import Batch
+
+ONLINE, TARGET, AVERAGE = "online/", "target/", "average/"  # before the names of parameters
 
 
 class Update(NamedTuple):
@@ -35,17 +40,21 @@ class Update(NamedTuple):
     """Mean of Q(s, a) over the batch."""
 
 
+AVERAGED_SHARE = 0.1  # of the updates so far, at most: what was learnt first does not burden the average for long
+
+
 class D3QN:
-    """Online and target network with their optimiser, and the count of updates."""
+    """Online and target network with their optimiser, the average of the online one, and the count of updates."""
 
     def __init__(self, config: Config, device: torch.device) -> None:
-        """Makes both networks equal, drawn from torch's global generator: seed it before."""
+        """Makes all networks equal, drawn from torch's global generator: seed it before."""
         self._settings = config.learner
         self.device = device
         self.online = DuelingNetwork(config.network, config.state_steps).to(device)
         self.target = DuelingNetwork(config.network, config.state_steps).to(device)
         self.target.load_state_dict(self.online.state_dict())
         self.target.requires_grad_(False).eval()  # dropout is for learning: no noise in targets
+        self.average = deepcopy(self.target) if config.learner.averaged_updates else None
         self.num_updates = 0
         self._values: tuple[Callable[..., Values], Callable[..., Values]] = (self.online, self.target)
         if config.learner.compile:
@@ -84,6 +93,7 @@ class D3QN:
         self.optimiser.step()
         self.num_updates += 1
         self._follow()
+        self._take_average()
         return Update(errors.detach().cpu().numpy(), float(loss.detach()), float(norm), float(q.detach().mean()))
 
     def weights(self) -> dict[str, NDArray[np.float32]]:
@@ -91,22 +101,24 @@ class D3QN:
         return parameters_of(self.online)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Returns everything that learning continues from: both networks and the optimiser's state, by name."""
-        arrays: dict[str, NDArray[Any]] = {f"online/{k}": v for k, v in parameters_of(self.online).items()}
-        arrays |= {f"target/{k}": v for k, v in parameters_of(self.target).items()}
+        """Returns everything that learning continues from: the networks and the optimiser's state, by name."""
+        arrays: dict[str, NDArray[Any]] = {}
+        for prefix, network in self._networks().items():
+            arrays |= {prefix + name: array for name, array in parameters_of(network).items()}
         for number, state in self.optimiser.state_dict()["state"].items():
             for key, value in state.items():
                 arrays[f"optimiser/{number}/{key}"] = torch.as_tensor(value).cpu().numpy().copy()
         return arrays
 
     def restore(self, arrays: dict[str, NDArray[Any]], num_updates: int) -> None:
-        """Continues from what `arrays` returned.
+        """Continues from what `arrays` returned; an average that they lack begins anew from the online network.
 
         Raises:
             ValueError: the arrays are of another network or another optimiser.
         """
-        for name, network in (("online/", self.online), ("target/", self.target)):
-            load_parameters(network, {k.removeprefix(name): v for k, v in arrays.items() if k.startswith(name)})
+        for prefix, network in self._networks().items():
+            source = prefix if prefix != AVERAGE or any(name.startswith(AVERAGE) for name in arrays) else ONLINE
+            load_parameters(network, {k.removeprefix(source): v for k, v in arrays.items() if k.startswith(source)})
         state: dict[int, dict[str, torch.Tensor]] = {}
         for name, array in arrays.items():
             if name.startswith("optimiser/"):
@@ -125,14 +137,30 @@ class D3QN:
             return tensor.pin_memory().to(self.device, non_blocking=True)
         return tensor
 
+    def _networks(self) -> dict[str, DuelingNetwork]:
+        """Returns all networks by the prefix of their parameters' names."""
+        networks = {ONLINE: self.online, TARGET: self.target}
+        return networks if self.average is None else networks | {AVERAGE: self.average}
+
     def _follow(self) -> None:
         period, tau = self._settings.target_period, self._settings.target_tau
         if period == 0:
-            with torch.no_grad():
-                for slow, fast in zip(self.target.parameters(), self.online.parameters(), strict=True):
-                    slow.lerp_(fast, tau)
+            _approach(self.target, self.online, tau)
         elif self.num_updates % period == 0:
             self.target.load_state_dict(self.online.state_dict())
+
+    def _take_average(self) -> None:
+        """Averages over `averaged_updates`, exponentially; at first over as large a share of the updates so far."""
+        if self.average is not None:
+            updates = min(self._settings.averaged_updates, max(AVERAGED_SHARE * self.num_updates, 1.0))
+            _approach(self.average, self.online, 1.0 / updates)
+
+
+def _approach(slow: DuelingNetwork, fast: DuelingNetwork, share: float) -> None:
+    """Moves the parameters of one network towards those of another, by a share of the difference."""
+    with torch.no_grad():
+        for moved, goal in zip(slow.parameters(), fast.parameters(), strict=True):
+            moved.lerp_(goal, share)
 
 
 def _optimiser(network: DuelingNetwork, learner: settings.Learner) -> torch.optim.Optimizer:

@@ -214,11 +214,12 @@ def _snapshot(path: Path, config: Config) -> SnapshotFacts:
 
 
 def _hashes_of(arrays: dict[str, Any]) -> dict[str, str]:
-    """Returns the hashes of network, target network and optimiser of a learner's arrays."""
-    parts = {"network": "online/", "target": "target/", "optimiser": "optimiser/"}
+    """Returns the hashes of network, target network, averaged network and optimiser of a learner's arrays."""
+    parts = {"network": "online/", "target": "target/", "average": "average/", "optimiser": "optimiser/"}
     return {
-        name: digest({key: array for key, array in arrays.items() if key.startswith(prefix)})
+        name: digest(part)
         for name, prefix in parts.items()
+        if (part := {key: array for key, array in arrays.items() if key.startswith(prefix)})
     }
 
 

@@ -15,7 +15,7 @@ from apex_bat.replay.store import ROW_RESERVE
 from apex_bat.roles.plan import roles_of
 
 NUM_SNAPSHOTS = 3  # the newest, the one before, and the one being written
-NUM_NETWORKS = 4  # in a checkpoint, of float32: online, target, and two moments of the optimiser
+NUM_NETWORKS = 5  # in a checkpoint, of float32: online, target, average, and two moments of the optimiser
 _ROW_BYTES = 4 * FRAME_VALUES + 2  # float32, action and step
 _log = logging.getLogger(__name__)
 

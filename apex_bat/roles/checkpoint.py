@@ -40,11 +40,12 @@ class Checkpoint(NamedTuple):
     counters: dict[str, Any]
     """Whatever else the learner continues from: weights version, random states."""
     arrays: dict[str, NDArray[Any]]
-    """`online/...`, `target/...` and `optimiser/...`."""
+    """`online/...`, `target/...`, `optimiser/...`, and `average/...` where the learner averages."""
 
     def policy_parameters(self) -> dict[str, NDArray[np.float32]]:
-        """Returns the online network's parameters by name."""
-        return {k.removeprefix("online/"): v for k, v in self.arrays.items() if k.startswith("online/")}
+        """Returns by name the parameters to fly with: the averaged ones, or the online network's without them."""
+        prefix = "average/" if any(name.startswith("average/") for name in self.arrays) else "online/"
+        return {k.removeprefix(prefix): v for k, v in self.arrays.items() if k.startswith(prefix)}
 
 
 def fingerprint(config: Config) -> dict[str, Any]:

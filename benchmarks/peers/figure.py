@@ -19,7 +19,7 @@ LOOKS = {
     "sb3": (Look("#d55e00", "-.", ""), "^"),
     "rllib": (Look("#009e73", ":", ""), "D"),
     "apex_bat_serial": (Look("#cc79a7", (0, (6, 2)), ""), "v"),
-    "apex_bat_unmirrored": (Look("#e69f00", (0, (3, 1, 1, 1)), ""), "P"),
+    "apex_bat_bare": (Look("#e69f00", (0, (3, 1, 1, 1)), ""), "P"),
 }
 """Okabe and Ito's colours; dashes and marks tell the lines apart in grey."""
 GRID_S = 5.0

@@ -68,8 +68,8 @@ ABLATIONS: tuple[Entry, ...] = (
         ("registered",), mode=("--serial",),
     ),
     Entry(
-        "apex_bat_unmirrored", "apex_bat, unmirrored", "apex_bat without mirror images in its batches", _OURS,
-        ("registered",), settings=("learner.mirror=false",),
+        "apex_bat_bare", "apex_bat, bare", "apex_bat without mirror images and without averaged parameters", _OURS,
+        ("registered",), settings=("learner.mirror=false", "learner.averaged_updates=0"),
     ),
 )  # fmt: skip
 """Not part of a contest unless they are named: they tell what of a difference comes from where."""

@@ -77,6 +77,36 @@ def test_soft_target_moves_by_tau() -> None:
         torch.testing.assert_close(new, old + 0.25 * (online - old))
 
 
+def test_the_average_is_that_of_the_newest_updates_and_exponential_after_them() -> None:
+    learner = agent(averaged_updates=2)
+    generator = np.random.default_rng(0)
+    averaged = learner.weights()["value.0.weight"]
+    for update in range(1, 41):
+        learner.update(two_state_batch(generator))
+        share = 1.0 / min(2.0, max(0.1 * update, 1.0))  # all of it for 10 updates, a half from 20 on
+        averaged = averaged + share * (learner.weights()["value.0.weight"] - averaged)
+    found = learner.arrays()["average/value.0.weight"]
+    np.testing.assert_allclose(found, averaged, rtol=1e-5, atol=1e-7)
+    assert not np.allclose(found, learner.weights()["value.0.weight"], rtol=1e-5, atol=1e-7)
+
+
+def test_averaging_changes_nothing_of_what_is_learnt() -> None:
+    with_average, without = agent(averaged_updates=100), agent(averaged_updates=0)
+    generator = np.random.default_rng(0)
+    for _ in range(5):
+        batch = two_state_batch(generator)
+        assert with_average.update(batch).loss == without.update(batch).loss
+    assert not [name for name in without.arrays() if name.startswith("average/")]
+
+
+def test_an_average_that_a_checkpoint_lacks_begins_from_its_online_network() -> None:
+    without, with_average = agent(averaged_updates=0), agent(averaged_updates=100)
+    without.update(two_state_batch(np.random.default_rng(0)))
+    with_average.restore(without.arrays(), without.num_updates)
+    for name, array in without.weights().items():
+        np.testing.assert_array_equal(with_average.arrays()[f"average/{name}"], array)
+
+
 def test_zero_weights_leave_the_network_as_it_was() -> None:
     learner = agent()
     before = learner.weights()
@@ -108,12 +138,12 @@ def test_gradient_is_clipped_to_its_norm() -> None:
 @pytest.mark.parametrize("optimiser", ["rmsprop", "adam"])
 @pytest.mark.parametrize("centred", [True, False])
 def test_a_restored_agent_goes_on_bit_for_bit(optimiser: str, centred: bool) -> None:
-    original = agent(optimiser=optimiser, rmsprop_centred=centred, target_period=7)
+    original = agent(optimiser=optimiser, rmsprop_centred=centred, target_period=7, averaged_updates=4)
     generator = np.random.default_rng(0)
     batches = [two_state_batch(generator) for _ in range(10)]
     for batch in batches[:5]:
         original.update(batch)
-    copy = agent(optimiser=optimiser, rmsprop_centred=centred, target_period=7)
+    copy = agent(optimiser=optimiser, rmsprop_centred=centred, target_period=7, averaged_updates=4)
     copy.restore(original.arrays(), original.num_updates)
     for batch in batches[5:]:
         assert original.update(batch).loss == copy.update(batch).loss

@@ -118,7 +118,8 @@ def test_apex_bat_is_started_with_settings_that_it_knows(tmp_path: Path) -> None
         assert config.checkpoint.period_s == 10.0
         assert config.train.max_minutes is not None
         assert config.train.max_minutes > 2.0, "the contest ends it, not this"
-        assert config.learner.mirror == (entry.name != "apex_bat_unmirrored")
+        bare = entry.name == "apex_bat_bare"
+        assert (config.learner.mirror, config.learner.averaged_updates > 0) == (not bare, not bare)
         assert ("--serial" in command) == (entry.name == "apex_bat_serial")
 
 

@@ -28,6 +28,13 @@ def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.policy_parameters()["a"], [7, 7])
 
 
+def test_the_average_is_what_flies_where_there_is_one() -> None:
+    arrays = {"online/a": np.zeros(2, np.float32), "average/a": np.ones(2, np.float32)}
+    found = Checkpoint(7, {}, {}, arrays).policy_parameters()
+    assert list(found) == ["a"]
+    np.testing.assert_array_equal(found["a"], [1, 1])
+
+
 def test_only_the_newest_are_kept_and_the_best_stays(tmp_path: Path) -> None:
     checkpoint.mark_best(tmp_path, made(1), (1.0, 5.0))
     for step in range(2, 8):

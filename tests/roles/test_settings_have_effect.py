@@ -26,6 +26,7 @@ from apex_bat.replay.server import ReplayServer
 from apex_bat.replay.store import ReplayStore
 from apex_bat.replay.writer import ReplayWriter
 from apex_bat.roles.actor import Actor
+from apex_bat.roles.checkpoint import Checkpoint
 from apex_bat.roles.learner import Learner
 from apex_bat.roles.plan import Role
 from apex_bat.roles.reporting import RoleReporter
@@ -53,6 +54,16 @@ def learned(config: Config, _: Path) -> float:
     for _round in range(3):
         agent.update(batch_of(16))
     return float(sum(np.abs(array).astype(np.float64).sum() for array in agent.weights().values()))
+
+
+def averaged(config: Config, _: Path) -> bool:
+    """Whether what is handed out after some updates is another network than the online one."""
+    torch.manual_seed(0)
+    agent = D3QN(config, torch.device("cpu"))
+    for _round in range(20):
+        agent.update(batch_of(16))
+    handed_out = Checkpoint(20, {}, {}, agent.arrays()).policy_parameters()
+    return any(not np.array_equal(array, handed_out[name]) for name, array in agent.weights().items())
 
 
 def computed(config: Config, _: Path) -> object:
@@ -216,6 +227,7 @@ CASES: dict[str, tuple[Measure, str]] = {
     "learner.num_step": (chunked, "1"),
     "learner.target_period": (learned, "1"),
     "learner.target_tau": (learned, "0.5"),
+    "learner.averaged_updates": (averaged, "0"),
     "learner.weights_period": (broadcast, "3"),
     "learner.precision": (learned, "bfloat16"),
     "learner.prefetch": (requested, "2"),

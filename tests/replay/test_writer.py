@@ -122,22 +122,28 @@ def test_every_transition_is_accounted_for_under_random_disconnects(
     small = msgspec.structs.replace(free_running, replay=msgspec.structs.replace(free_running.replay, capacity=300))
     server = serving(small, address)
     writers = [ReplayWriter(address, f"actor{i}", 4, resend_s=0.02) for i in range(3)]
-    sent = spoilt = 0
+    sent = spoilt = breaks = received = 0
+
+    def turn() -> None:
+        nonlocal sent, spoilt, breaks, received
+        writer = writers[generator.integers(3)]
+        if writer.has_room:
+            chunk = make_chunk(int(generator.integers(1, 12)))
+            if generator.random() < 0.1:
+                chunk.rewards[0] = np.inf
+                spoilt += len(chunk.starts)
+            writer.send([chunk], 0)
+            sent += len(chunk.starts)
+        arrived = int(server.metrics()["replay.received"])
+        if arrived > received and generator.random() < 0.1:  # all connections break, with whatever is in them
+            server._listener.close()
+            server._listener = Listener(zmq.ROUTER, address, options={zmq.ROUTER_MANDATORY: 1})
+            breaks, received = breaks + 1, arrived
+        writer.poll(0.0)
+        server.serve(0.001)
+
     try:
-        for _ in range(150):
-            writer = writers[generator.integers(3)]
-            if writer.has_room:
-                chunk = make_chunk(int(generator.integers(1, 12)))
-                if generator.random() < 0.1:
-                    chunk.rewards[0] = np.inf
-                    spoilt += len(chunk.starts)
-                writer.send([chunk], 0)
-                sent += len(chunk.starts)
-            if generator.random() < 0.05:  # all connections break, with whatever is in them
-                server._listener.close()
-                server._listener = Listener(zmq.ROUTER, address, options={zmq.ROUTER_MANDATORY: 1})
-            writer.poll(0.0)
-            server.serve(0.001)
+        until(lambda: breaks >= 5 and spoilt >= 10 and sent >= 200, turn)
         for writer in writers:
             until(lambda w=writer: not w.unacknowledged, lambda: server.serve(0.005), lambda w=writer: w.poll(0.0))
         figures = server.metrics()

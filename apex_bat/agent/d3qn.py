@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from apex_bat.agent.inference import initial_parameters
 from apex_bat.agent.losses import double_q_target, td_errors, weighted_loss
 from apex_bat.agent.mirror import mirror_batch
 from apex_bat.agent.network import DuelingNetwork, Values, load_parameters, parameters_of
@@ -47,10 +48,11 @@ class D3QN:
     """Online and target network with their optimiser, the average of the online one, and the count of updates."""
 
     def __init__(self, config: Config, device: torch.device) -> None:
-        """Makes all networks equal, drawn from torch's global generator: seed it before."""
+        """Makes all networks equal, with the parameters that the seed gives; dropout draws from torch's generator."""
         self._settings = config.learner
         self.device = device
         self.online = DuelingNetwork(config.network, config.state_steps).to(device)
+        load_parameters(self.online, initial_parameters(config.network, config.state_steps, config.seed))
         self.target = DuelingNetwork(config.network, config.state_steps).to(device)
         self.target.load_state_dict(self.online.state_dict())
         self.target.requires_grad_(False).eval()  # dropout is for learning: no noise in targets
@@ -64,7 +66,7 @@ class D3QN:
     def optimiser(self) -> torch.optim.Optimizer:
         """The optimiser, made when it is first needed: for it torch imports its compiler, in 2 s of CPU (measured).
 
-        So a new learner broadcasts its first weights before, and the actors fly so much earlier.
+        So a new learner broadcasts its weights before, and actors that wait for them fly so much earlier.
         """
         return _optimiser(self.online, self._settings)
 
@@ -161,6 +163,11 @@ def _approach(slow: DuelingNetwork, fast: DuelingNetwork, share: float) -> None:
     with torch.no_grad():
         for moved, goal in zip(slow.parameters(), fast.parameters(), strict=True):
             moved.lerp_(goal, share)
+
+
+def import_compiler() -> None:
+    """Makes torch import what it imports when the first optimiser is made, see `D3QN.optimiser`."""
+    torch.optim.RMSprop([torch.nn.Parameter(torch.zeros(1))])
 
 
 def _optimiser(network: DuelingNetwork, learner: settings.Learner) -> torch.optim.Optimizer:

@@ -18,6 +18,7 @@ from apex_bat.experience import ACTION_MEMORY, NUM_ACTIONS, NUM_BINS, NUM_EARS, 
 
 Array = NDArray[np.float32]
 FILTER_BINS = 3
+NETWORK_STREAM = 4  # beside the run's seed, for a random stream that is no role's
 
 
 class PolicyValues(NamedTuple):
@@ -129,6 +130,21 @@ def parameter_shapes(network: settings.Network, memory_steps: int) -> dict[str, 
             shapes[f"{name}.{i * layers_apart}.bias"] = (units,)
             inputs = units
     return shapes
+
+
+def initial_parameters(network: settings.Network, memory_steps: int, seed: int) -> dict[str, Array]:
+    """Returns the parameters that a run begins with: whoever knows its settings has them, before there is a learner.
+
+    Weights and biases are uniform within 1 / sqrt(inputs of the layer), as torch draws them.
+    """
+    generator = np.random.default_rng([seed, NETWORK_STREAM])
+    parameters: dict[str, Array] = {}
+    bound = 0.0
+    for name, shape in parameter_shapes(network, memory_steps).items():
+        if name.endswith(".weight"):  # the bias follows its weights
+            bound = 1.0 / math.sqrt(math.prod(shape[1:]))
+        parameters[name] = generator.uniform(-bound, bound, shape).astype(np.float32)
+    return parameters
 
 
 def part_norms(parameters: Mapping[str, Array]) -> dict[str, float]:

@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from apex_bat.agent.exploration import GREEDY_EPSILON, annealed, choose_actions, ladder_of_actor
-from apex_bat.agent.inference import Policy, PolicyValues, parameter_shapes
+from apex_bat.agent.inference import Policy, PolicyValues, initial_parameters, parameter_shapes
 from apex_bat.agent.n_step import Accumulator
 from apex_bat.experience import Chunk, States
 from apex_bat.replay.client import TurnWriter
@@ -87,6 +87,7 @@ class Actor:
             for _ in range(config.bats_per_actor)
         ]
         self._policy = Policy(config.network, config.state_steps)
+        self._begins_the_run = assignment.begins_the_run
         self._learner_step = -1
         self._parameters: dict[str, NDArray[np.float32]] = {}
         self._phases = Phases("simulation", "policy", "gathering", clock=assignment.clock)
@@ -103,8 +104,8 @@ class Actor:
         """Says whether a step can be taken now; else waits for weights or for the replay, and reports for whom."""
         self._writer.poll(0.0)
         self._weights.wait(0.0)  # whoever is held back, or looks seldom, says so that it still wants what is new
-        if self._learner_step < 0 and not self._take_up_weights(timeout_s):
-            return self._wait("waiting for the learner's first weights")
+        if self._learner_step < 0 and not (self._take_up_weights(timeout_s) or self._take_up_initial_weights()):
+            return self._wait("waiting for the learner's weights")
         if not self._writer.has_room:
             self._writer.poll(timeout_s)
             if not self._writer.has_room:
@@ -253,6 +254,14 @@ class Actor:
         if weights is None:
             return False
         self._load(weights.learner_step, weights.arrays)
+        return True
+
+    def _take_up_initial_weights(self) -> bool:
+        """Takes up what a learner broadcasts first, of which it is known what it is, while it still imports torch."""
+        if not self._begins_the_run:
+            return False
+        config = self._config
+        self._load(0, initial_parameters(config.network, config.state_steps, config.seed))
         return True
 
     def _load(self, learner_step: int, arrays: dict[str, NDArray[np.float32]]) -> None:

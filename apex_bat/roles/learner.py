@@ -81,7 +81,7 @@ def make_agent(assignment: Assignment) -> tuple[D3QN, int]:
 
 
 def new_agent(assignment: Assignment) -> D3QN:
-    """Returns an agent that has learned nothing yet; seeds torch's generator, which draws its weights."""
+    """Returns an agent that has learned nothing yet; seeds torch's generator, from which dropout draws."""
     config = assignment.config
     torch.set_num_threads(config.train.threads)
     torch.manual_seed(config.seed)

@@ -113,6 +113,11 @@ class Assignment(NamedTuple):
         return load_keys(Path(folder)) if folder else None
 
     @property
+    def begins_the_run(self) -> bool:
+        """Whether nothing of the run was flown, and so nothing learnt, when this role was started."""
+        return self.incarnation == 0 and self.flown_steps == 0
+
+    @property
     def host(self) -> str:
         """Name of this machine."""
         return socket.gethostname()

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from apex_bat.agent.d3qn import D3QN
-from apex_bat.agent.inference import Policy, parameter_shapes, part_norms
+from apex_bat.agent.inference import Policy, initial_parameters, parameter_shapes, part_norms
 from apex_bat.agent.network import DuelingNetwork, load_parameters, parameters_of
 from apex_bat.config import load
 from apex_bat.config.settings import Network
@@ -101,6 +101,30 @@ def test_weights_of_another_network_are_refused_by_name() -> None:
         Policy(Network(), 3).load(arrays)
     with pytest.raises(ValueError, match="another network"):
         load_parameters(DuelingNetwork(Network(), 3), arrays)
+
+
+@pytest.mark.parametrize("settings", NETWORKS)
+def test_initial_parameters_are_drawn_as_torch_draws_them(settings: Network) -> None:
+    ours = initial_parameters(settings, 3, seed=5)
+    torch.manual_seed(0)
+    for name, theirs in parameters_of(DuelingNetwork(settings, 3)).items():
+        assert (ours[name].shape, ours[name].dtype) == (theirs.shape, theirs.dtype)
+        if theirs.size > 1000:  # the greatest of so many is the bound, to a percent
+            assert np.abs(ours[name]).max() == pytest.approx(np.abs(theirs).max(), rel=0.01)
+            assert ours[name].std() == pytest.approx(theirs.std(), rel=0.1)
+            assert abs(ours[name].mean()) < 0.1 * theirs.std()
+
+
+def test_initial_parameters_follow_from_the_seed() -> None:
+    one, again, other = (initial_parameters(Network(), 3, seed)["value.0.weight"] for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one, again)
+    assert not np.array_equal(one, other)
+
+
+def test_a_learner_begins_with_the_initial_parameters() -> None:
+    config = load(None, ["seed=7"])
+    for name, array in initial_parameters(config.network, config.state_steps, 7).items():
+        np.testing.assert_array_equal(D3QN(config, torch.device("cpu")).weights()[name], array)
 
 
 def test_norms_are_those_of_whole_parts() -> None:

@@ -18,7 +18,7 @@ from apex_bat.roles.learner import new_agent
 from apex_bat.roles.plan import Addresses, Assignment, Role
 from apex_bat.roles.reporting import RoleReporter
 from apex_bat.roles.serial import BoardReader, StoreSink, WeightsBoard
-from apex_bat.storage import State, read_arrays, write_arrays
+from apex_bat.storage import State, part_of, read_arrays, write_arrays
 from apex_bat.transport.messages import Report
 
 SMALL = ("network.channels=[4]", "network.strides=[3]", "network.hidden=[8]", "bats_per_actor=3", "actors=2",
@@ -55,6 +55,33 @@ class Flying:
         for _ in range(steps):
             assert self.actor.is_ready(0.0)
             self.actor.step()
+
+
+def lone_actor(config: Config, stack: ExitStack, incarnation: int, flown_steps: int) -> Actor:
+    """An actor whose learner has broadcast nothing yet."""
+    stop, nowhere = threading.Event(), Addresses("", "", "")
+    assignment = Assignment(Role("actor", 0), config, Path(), nowhere, stop, incarnation, flown_steps, lambda: 0.0)
+    sink = StoreSink(ReplayStore(config, np.random.default_rng(0)), "actor-0")
+    reporter = RoleReporter(assignment, resources=dict, line=Dropped())
+    return stack.enter_context(closing(Actor(assignment, sink, BoardReader(WeightsBoard()), reporter)))
+
+
+def test_an_actor_of_a_new_run_flies_before_there_is_a_learner_and_with_its_first_weights() -> None:
+    config = load(None, [*SMALL, "seed=3"])
+    with ExitStack() as stack:
+        actor = lone_actor(config, stack, 0, 0)
+        assert actor.is_ready(0.0)
+        actor.step()
+        _, flown_with = part_of(actor.state(), "parameters")
+    first = new_agent(Assignment(Role("learner", 0), config, Path(), Addresses("", "", ""), threading.Event(), 0))
+    for name, array in first.weights().items():
+        np.testing.assert_array_equal(flown_with[name], array)
+
+
+@pytest.mark.parametrize(("incarnation", "flown_steps"), [(1, 0), (0, 600)])
+def test_an_actor_of_a_run_that_has_learnt_waits_for_its_learner(incarnation: int, flown_steps: int) -> None:
+    with ExitStack() as stack:
+        assert not lone_actor(load(None, list(SMALL)), stack, incarnation, flown_steps).is_ready(0.0)
 
 
 def test_an_actor_that_is_held_back_keeps_saying_that_it_wants_weights(monkeypatch: pytest.MonkeyPatch) -> None:

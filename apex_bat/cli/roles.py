@@ -16,12 +16,16 @@ Number = Annotated[int, typer.Option(help="Which of its kind, from 0.", min=0)]
 Incarnation = Annotated[int, typer.Option(help="Number of this life of the role; no other has had it.", min=0)]
 Flown = Annotated[int, typer.Option(help="Environment steps of the whole run before this start.", min=0)]
 Leash = Annotated[bool, typer.Option("--leash", help="End when standard input ends.")]
+Reserved = Annotated[
+    bool,
+    typer.Option("--reserve", help="Import all, then wait for standard input to say which life to begin, or to end."),
+]
 Ordered = Annotated[
     bool, typer.Option("--orders", help="Take addresses and keys from standard input, and end when it ends.")
 ]
 
 
-def _command(kind: Kind, text: str) -> Callable[[Path, int, int, bool, int, bool], int]:
+def _command(kind: Kind, text: str) -> Callable[[Path, int, int, bool, int, bool, bool], int]:
     def run(
         run: Run,
         number: Number = 0,
@@ -29,16 +33,19 @@ def _command(kind: Kind, text: str) -> Callable[[Path, int, int, bool, int, bool
         leash: Leash = False,
         flown: Flown = 0,
         orders: Ordered = False,
+        reserve: Reserved = False,
     ) -> int:
         from apex_bat.roles.process import run_process
 
-        raise typer.Exit(run_process(kind, number, run, incarnation, leash, flown, is_ordered=orders))
+        raise typer.Exit(
+            run_process(kind, number, run, incarnation, leash, flown, is_ordered=orders, in_reserve=reserve)
+        )
 
     run.__doc__ = text
     return run
 
 
-COMMANDS: dict[Kind, Callable[[Path, int, int, bool, int, bool], int]] = {
+COMMANDS: dict[Kind, Callable[[Path, int, int, bool, int, bool, bool], int]] = {
     "actor": _command("actor", "Run one actor of a run."),
     "replay": _command("replay", "Run the replay server of a run."),
     "learner": _command("learner", "Run the learner of a run."),

@@ -101,6 +101,8 @@ class Launch(Section, frozen=True):
     """Quick failures in a row after which a role is given up and the run ends."""
     quick_failure_s: Positive = 20.0
     """A failure is quick when the role lived shorter than this. It works after 3 to 8 s (measured on two cores)."""
+    learner_in_reserve: bool = True
+    """Whether a process that has imported torch waits to take the place of a learner that dies. It takes 320 MB."""
     start_timeout_s: Positive = 120.0
     """A new process that has not been heard of for this long is killed and replaced; importing torch takes seconds."""
     heartbeat_timeout_s: Positive = 30.0

@@ -9,7 +9,7 @@ import signal
 import socket
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from types import FrameType
 
@@ -18,7 +18,7 @@ import msgspec
 from apex_bat.config import Config
 from apex_bat.launching.course import Course, Ended
 from apex_bat.launching.live import View
-from apex_bat.launching.processes import RoleProcess, threads_of
+from apex_bat.launching.processes import Recipe, RoleProcess, has_reserve, threads_of
 from apex_bat.launching.standing import NEW_RUN, Origin
 from apex_bat.roles.logs import launcher_log
 from apex_bat.roles.plan import Addresses, Role, roles_of
@@ -53,10 +53,18 @@ def train(
             roles=[role.name for role in roles_of(config)],
         )
 
-        def start(role: Role, incarnation: int, flown_steps: int) -> RoleProcess:
-            return RoleProcess(role, run, incarnation, threads_of(role, config), flown_steps, lock)
+        recipes = {role: Recipe(role, run, threads_of(role, config), lock=lock) for role in roles_of(config)}
+        with ExitStack() as stack:
+            reserves = {
+                role: stack.enter_context(closing(recipe.reserve()))
+                for role, recipe in recipes.items()
+                if has_reserve(role, config)
+            }
 
-        return Course(config, run, collector, start, origin, part).go(view)
+            def start(role: Role, incarnation: int, flown_steps: int) -> RoleProcess:
+                return RoleProcess(recipes[role], incarnation, flown_steps, reserve=reserves.get(role))
+
+            return Course(config, run, collector, start, origin, part).go(view)
 
 
 def heeded(*names: str) -> list[signal.Signals]:

@@ -10,18 +10,63 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from apex_bat.config import Config
 from apex_bat.launching import ONE_THREAD
 from apex_bat.launching.leftovers import is_needed
+from apex_bat.launching.reserve import AFTER_S, Reserve
 from apex_bat.launching.supervisor import Exit
-from apex_bat.roles.orders import STOP
+from apex_bat.roles.orders import STOP, line_of_life
 from apex_bat.roles.plan import Role
 
 KILL_TIMEOUT_S = 2.0
 """How long a killed process is waited for. One that waits for a dead disk or network drive takes longer to go."""
+
+
+class Recipe(NamedTuple):
+    """What all processes of a role in a run have in common."""
+
+    role: Role
+    run: Path
+    """The run folder; output is appended to `logs/NAME.log` there."""
+    num_threads: int
+    """Of numpy's linear algebra and of torch."""
+    is_ordered: bool = False
+    """Whether it is told addresses and keys on its standard input, see `roles.orders`; else it reads addresses.json."""
+    lock: int | None = None
+    """File descriptor of the run's lock, which the process keeps open as long as it lives."""
+    folder: Path | None = None
+    """To work in, where paths of the settings are relative to; None: that of this process."""
+
+    @property
+    def log(self) -> Path:
+        """The role's log."""
+        return self.run / "logs" / f"{self.role.name}.log"
+
+    def start(self, *life: str) -> subprocess.Popen[bytes]:
+        """Starts a process with options that say which life it is to begin.
+
+        Raises:
+            OSError: it cannot be started.
+        """
+        command = [sys.executable, "-m", "apex_bat", self.role.kind, "--run", str(self.run), "--leash",
+                   "--number", str(self.role.number), *life, *(("--orders",) if self.is_ordered else ())]  # fmt: skip
+        environment = os.environ | dict.fromkeys(ONE_THREAD, str(self.num_threads))
+        flags = 0 if os.name == "posix" else subprocess.CREATE_NEW_PROCESS_GROUP  # type: ignore[attr-defined]
+        with self.log.open("ab") as output:
+            return subprocess.Popen(  # noqa: S603  # our own command
+                command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=environment,
+                start_new_session=os.name == "posix", creationflags=flags,
+                pass_fds=() if self.lock is None else (self.lock,), cwd=self.folder,
+            )  # fmt: skip
+
+    def reserve(self) -> Reserve:
+        """Returns a reserve of the role's processes; none is started yet."""
+        return Reserve(lambda: self.start("--reserve"))
 
 
 class RoleProcess:
@@ -29,47 +74,36 @@ class RoleProcess:
 
     def __init__(
         self,
-        role: Role,
-        run: Path,
+        recipe: Recipe,
         incarnation: int,
-        num_threads: int,
         flown_steps: int = 0,
-        lock: int | None = None,
         *,
-        orders: bytes | None = None,
-        folder: Path | None = None,
+        orders: bytes = b"",
         cleans: bool = True,
+        reserve: Reserve | None = None,
     ) -> None:
-        """Starts it; its output is appended to `logs/NAME.log`.
+        """Starts it, or lets one in reserve begin.
 
         Args:
-            role: which.
-            run: the run folder.
+            recipe: where from.
             incarnation: number of this life of the role.
-            num_threads: of numpy's linear algebra and of torch.
             flown_steps: environment steps of the whole run so far.
-            lock: file descriptor of the run's lock, which the process keeps open as long as it lives.
-            orders: the line that tells it addresses and keys, see `roles.orders`; None: it reads addresses.json.
-            folder: to work in, where paths of the settings are relative to; None: that of this process.
+            orders: the line that tells it addresses and keys, for one that is ordered.
             cleans: whether to remove, once it has ended, the files that it was writing.
+            reserve: of processes of this role; None: each is started when it is needed.
 
         Raises:
             OSError: it cannot be started.
         """
-        self._role, self._run, self._cleans, self._is_ordered = role, run, cleans, orders is not None
-        self._log = run / "logs" / f"{role.name}.log"
-        command = [sys.executable, "-m", "apex_bat", role.kind, "--run", str(run), "--leash",
-                   "--number", str(role.number), "--incarnation", str(incarnation),
-                   "--flown", str(flown_steps), *(("--orders",) if orders is not None else ())]  # fmt: skip
-        environment = os.environ | dict.fromkeys(ONE_THREAD, str(num_threads))
-        flags = 0 if os.name == "posix" else subprocess.CREATE_NEW_PROCESS_GROUP  # type: ignore[attr-defined]
-        with self._log.open("ab") as output:
-            self._process = subprocess.Popen(  # noqa: S603  # our own command
-                command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=environment,
-                start_new_session=os.name == "posix", creationflags=flags,
-                pass_fds=() if lock is None else (lock,), cwd=folder,
-            )  # fmt: skip
-        if orders is not None:
+        self._recipe, self._cleans, self._reserve = recipe, cleans, reserve
+        self._begun_s = time.monotonic()
+        prepared = None if reserve is None else reserve.take()
+        if prepared is None:
+            self._process = recipe.start("--incarnation", str(incarnation), "--flown", str(flown_steps))
+        else:
+            self._process = prepared
+            self.tell(line_of_life(incarnation, flown_steps))
+        if orders:
             self.tell(orders)
 
     @property
@@ -94,13 +128,15 @@ class RoleProcess:
         """Returns how it ended, with the last line of its log, or None while it runs."""
         code = self._process.poll()
         if code is None:
+            if self._reserve is not None and time.monotonic() - self._begun_s > AFTER_S:
+                self._reserve.tend()
             return None
         self._clean()
-        return Exit(code, last_line(self._log))
+        return Exit(code, last_line(self._recipe.log))
 
     def stop(self) -> None:
         """Asks it to save and end: lets go of the leash."""
-        if self._is_ordered:
+        if self._recipe.is_ordered:
             self.tell(STOP)
         if self._process.stdin is not None and not self._process.stdin.closed:
             with suppress(OSError):  # of orders that it did not read before it ended; the pipe is closed all the same
@@ -116,12 +152,17 @@ class RoleProcess:
 
     def _clean(self) -> None:
         if self._cleans:
-            remove_unfinished(self._run, self._role, self.pid)
+            remove_unfinished(self._recipe.run, self._recipe.role, self.pid)
 
 
 def threads_of(role: Role, config: Config) -> int:
     """Returns how many threads a role may use for linear algebra."""
     return config.train.threads if role.kind == "learner" else 1
+
+
+def has_reserve(role: Role, config: Config) -> bool:
+    """Whether a process waits to take the place of a role: of the learner, which imports torch and its compiler."""
+    return role.kind == "learner" and config.launch.learner_in_reserve
 
 
 def remove_unfinished(run: Path, role: Role, pid: int) -> None:

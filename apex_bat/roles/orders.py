@@ -1,5 +1,6 @@
 """What a launcher tells a role on its standard input: addresses and keys at first, later where a server has moved to.
 
+To a process in reserve, which has imported all that its role needs and waits, the first line says which life to begin.
 A line of JSON each. A pipe is seen by nobody else, so that keys need no file on the role's host. The line STOP before
 the end of the input means that the role is to save and end; an end without it, that its keeper has died. Then nobody is
 left who could say when the role has ended, and its replacement waits for it: it must be quick.
@@ -8,12 +9,13 @@ left who could say when the role has ended, and its replacement waits for it: it
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from collections import deque
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from apex_bat.roles.plan import Addresses
 from apex_bat.transport.security import Keys, TransportError
@@ -53,6 +55,38 @@ class Orders(Struct, frozen=True, forbid_unknown_fields=True):
 def line_of(addresses: Addresses, keys: Keys | None = None) -> bytes:
     """Returns orders as the line that `StandingOrders` reads."""
     return msgspec.json.encode(Orders(addresses, None if keys is None else _as_text(keys))) + b"\n"
+
+
+class Life(Struct, frozen=True, forbid_unknown_fields=True):
+    """The first line for a process in reserve."""
+
+    incarnation: Annotated[int, Meta(ge=0)]
+    flown_steps: Annotated[int, Meta(ge=0)]
+
+
+def line_of_life(incarnation: int, flown_steps: int) -> bytes:
+    """Returns the line that `await_life` reads."""
+    return msgspec.json.encode(Life(incarnation, flown_steps)) + b"\n"
+
+
+def await_life() -> Life | None:
+    """Returns the life that a process in reserve is to begin, from standard input; None: it is not needed.
+
+    Raises:
+        TransportError: something else came.
+    """
+    line = b""
+    while not line.endswith(b"\n"):
+        byte = os.read(0, 1)  # no more, or it would take what comes after
+        if not byte:
+            return None
+        line += byte
+        if len(line) > MAX_LINE_BYTES:
+            break
+    try:
+        return msgspec.json.decode(line, type=Life)
+    except (msgspec.MsgspecError, UnicodeDecodeError):
+        raise TransportError(f"standard input: a line of {len(line)} bytes begins no life") from None
 
 
 class StandingOrders:

@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
@@ -16,7 +17,7 @@ from types import FrameType
 from apex_bat.config import Config, ConfigError, load
 from apex_bat.replay.snapshot import SnapshotError
 from apex_bat.roles.logs import RotatingLog
-from apex_bat.roles.orders import ORPHANED_S, StandingOrders
+from apex_bat.roles.orders import ORPHANED_S, StandingOrders, await_life
 from apex_bat.roles.plan import Addresses, Assignment, Kind, Role, read_addresses, role_of
 from apex_bat.storage import StorageError
 from apex_bat.transport.security import AddressInUseError, TransportError
@@ -38,6 +39,7 @@ def run_process(
     flown_steps: int = 0,
     *,
     is_ordered: bool = False,
+    in_reserve: bool = False,
 ) -> int:
     """Runs a role until it is told to stop and returns its exit code.
 
@@ -49,6 +51,8 @@ def run_process(
         leashed: whether the end of standard input means stop; then the role writes its log itself.
         flown_steps: environment steps of the whole run before this start.
         is_ordered: whether addresses and keys come on standard input, see `roles.orders`; leashed as well.
+        in_reserve: whether to import all that the role needs and then wait for standard input to say which life to
+            begin, instead of the two numbers above.
 
     Returns:
         0 when it ended by itself or by its leash, 1 when it failed, 2 when starting it again would fail in the same
@@ -57,6 +61,17 @@ def run_process(
     faulthandler.enable()
     role = Role(kind, number)
     logging.basicConfig(level=logging.INFO, format=_line_format(role))
+    if in_reserve:
+        _be_continued_when_orphaned()
+        _prepare(kind)
+        try:
+            life = await_life()
+        except TransportError as error:
+            _log.error("%s", error)
+            return FAILED
+        if life is None:
+            return 0
+        incarnation, flown_steps = life.incarnation, life.flown_steps
     stop = threading.Event()
     heard = _hear_signals(stop)
     try:
@@ -148,16 +163,30 @@ def _line_format(role: Role) -> str:
     return f"%(asctime)s {role.name} %(levelname)s %(message)s"
 
 
-def _run(assignment: Assignment) -> None:
-    """Runs the role; each kind imports only what it needs."""
-    if assignment.role.kind == "actor":
+def _prepare(kind: Kind) -> None:
+    """Imports what a role will need."""
+    _entry_of(kind)
+    if kind == "learner":
+        from apex_bat.agent.d3qn import import_compiler
+
+        import_compiler()
+
+
+def _entry_of(kind: Kind) -> Callable[[Assignment], None]:
+    """Returns what runs a role; each kind imports only what it needs."""
+    if kind == "actor":
         from apex_bat.roles.actor import run_actor as run
-    elif assignment.role.kind == "replay":
+    elif kind == "replay":
         from apex_bat.roles.replay import run_replay as run
-    elif assignment.role.kind == "learner":
+    elif kind == "learner":
         from apex_bat.roles.learner import run_learner as run
     else:
         from apex_bat.roles.evaluator import run_evaluator as run
+    return run
+
+
+def _run(assignment: Assignment) -> None:
+    run = _entry_of(assignment.role.kind)
     if assignment.stop.is_set():  # by a leash that ended while it was imported: its replacement may be at work
         return
     _log.info("starts, pid %d", os.getpid())

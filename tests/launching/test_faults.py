@@ -92,6 +92,27 @@ def start(tmp_path: Path) -> Iterator[Start]:
         run.end()
 
 
+def test_a_process_in_reserve_takes_the_place_of_a_killed_learner_and_none_outlives_the_run(start: Start) -> None:
+    run = start()
+    run.until_it_learns()
+
+    def in_reserve() -> list[psutil.Process]:
+        children = psutil.Process(run.process.pid).children()
+        return [child for child in children if "--reserve" in child.cmdline() and child.pid not in run.pids()]
+
+    run.until(in_reserve, "a process is in reserve")
+    (waiting,) = in_reserve()
+    victim, step = run.roles()["learner"]["pid"], run.gauge("learner", "learner_step")
+    os.kill(victim, signal.SIGKILL)
+    run.until(lambda: run.roles()["learner"]["pid"] == waiting.pid, "it has become the learner")
+    run.until(lambda: run.gauge("learner", "learner_step") > step + 10, "it goes on")
+    run.until(in_reserve, "another one is in reserve")
+    (unused,) = in_reserve()
+    run.process.send_signal(signal.SIGINT)
+    run.output()
+    assert not unused.is_running()
+
+
 def test_who_waits_says_for_whom_and_a_standstill_is_told(start: Start) -> None:
     run = start(launch__stall_s="3.0")
     run.until_it_learns()

@@ -9,9 +9,12 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 
+from apex_bat.config import Config
 from apex_bat.config.settings import Launch
+from apex_bat.launching.processes import has_reserve
 from apex_bat.launching.progress import Progress
 from apex_bat.launching.rows import RowThinner
 from apex_bat.launching.supervisor import Exit, RoleFailedError, Supervisor
@@ -112,12 +115,17 @@ def ended_by_force(launch: Launch, _: Path) -> object:
     return ended.stderr.splitlines()[0]
 
 
+def reserved(launch: Launch, _: Path) -> bool:
+    return has_reserve(Role("learner", 0), msgspec.structs.replace(Config(), launch=launch))
+
+
 CASES: dict[str, tuple[Measure, float]] = {
     "backoff_s": (restarted, 3.0),
     "max_failures": (restarted, 2),
     "quick_failure_s": (restarted, 10.0),
     "start_timeout_s": (lambda launch, _: killed_after(launch, is_heard=False), 10.0),
     "heartbeat_timeout_s": (lambda launch, _: killed_after(launch, is_heard=True), 10.0),
+    "learner_in_reserve": (reserved, False),
     "stall_s": (stood_still, 10.0),
     "dense_rows_s": (thinned, 100.0),
     "log_max_mb": (logged, 0.5),

@@ -17,7 +17,7 @@ import pytest
 from apex_bat.config import load
 from apex_bat.config.loading import dumps
 from apex_bat.evaluation import runs
-from apex_bat.launching.processes import RoleProcess, remove_unfinished
+from apex_bat.launching.processes import Recipe, RoleProcess, remove_unfinished
 from apex_bat.roles.orders import ORPHANED_S, STOP, line_of
 from apex_bat.roles.plan import Addresses, Role
 from apex_bat.roles.resources import began_unix_s
@@ -136,7 +136,7 @@ def serves(run: Path) -> bool:
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_role_that_somebody_else_ends_saves_and_says_so(run: Path, number: signal.Signals, code: int) -> None:
-    process = RoleProcess(Role("replay", 0), run, 0, 1)
+    process = RoleProcess(Recipe(Role("replay", 0), run, 1), 0)
     try:
         eventually(lambda: serves(run), 30.0, "it serves")
         os.kill(process.pid, number)
@@ -147,7 +147,7 @@ def test_a_role_that_somebody_else_ends_saves_and_says_so(run: Path, number: sig
 
 
 def test_a_role_that_its_launcher_lets_go_of_ends_with_a_last_snapshot(run: Path) -> None:
-    process = RoleProcess(Role("replay", 0), run, 0, 1)
+    process = RoleProcess(Recipe(Role("replay", 0), run, 1), 0)
     try:
         eventually(lambda: serves(run), 30.0, "it serves")
         process.stop()
@@ -157,10 +157,60 @@ def test_a_role_that_its_launcher_lets_go_of_ends_with_a_last_snapshot(run: Path
         process.kill()
 
 
+def test_a_process_in_reserve_begins_the_life_that_it_is_told(run: Path) -> None:
+    recipe = Recipe(Role("replay", 0), run, 1)
+    reserve = recipe.reserve()
+    try:
+        reserve.tend()
+        waiting = reserve._process
+        assert waiting is not None
+        process = RoleProcess(recipe, 3, reserve=reserve)
+        assert process.pid == waiting.pid
+        try:
+            eventually(lambda: serves(run), 30.0, "it serves")
+            process.stop()
+            assert ended(process) == 0
+            assert (run / "replay" / "replay.snapshot").exists()
+        finally:
+            process.kill()
+    finally:
+        reserve.close()
+
+
+def test_a_process_in_reserve_that_is_not_needed_leaves_nothing(run: Path) -> None:
+    waiting = Recipe(Role("replay", 0), run, 1).start("--reserve")
+    assert waiting.stdin is not None
+    waiting.stdin.close()
+    assert waiting.wait(30.0) == 0
+    assert (run / "logs" / "replay.log").read_bytes() == b""
+    assert not any((run / "replay").iterdir())
+
+
+def test_a_line_that_begins_no_life_is_named(run: Path) -> None:
+    waiting = Recipe(Role("replay", 0), run, 1).start("--reserve")
+    assert waiting.stdin is not None
+    with waiting.stdin as pipe:
+        pipe.write(b"{}\n")
+    assert waiting.wait(30.0) == 1
+    assert "a line of 3 bytes begins no life" in (run / "logs" / "replay.log").read_text()
+
+
+def test_a_working_role_has_its_reserve_tended(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("apex_bat.launching.processes.AFTER_S", 0.0)
+    recipe = Recipe(Role("replay", 0), run, 1)
+    reserve = recipe.reserve()
+    process = RoleProcess(recipe, 0, reserve=reserve)
+    try:
+        eventually(lambda: process.poll() is None and reserve._process is not None, 10.0, "one is in reserve")
+    finally:
+        process.kill()
+        reserve.close()
+
+
 def test_a_crash_in_c_code_is_in_the_log_and_a_log_too_long_is_renamed_first(run: Path) -> None:
     log = run / "logs" / "replay.log"
     log.write_text("line of a former process\n" * 200)
-    process = RoleProcess(Role("replay", 0), run, 0, 1)
+    process = RoleProcess(Recipe(Role("replay", 0), run, 1), 0)
     try:
         eventually(lambda: serves(run), 30.0, "it serves")
         os.kill(process.pid, signal.SIGSEGV)
@@ -174,7 +224,7 @@ def test_a_crash_in_c_code_is_in_the_log_and_a_log_too_long_is_renamed_first(run
 
 def test_settings_that_a_role_cannot_use_are_the_line_that_a_person_reads(run: Path) -> None:
     (run / "config.toml").write_text("nonsense = 1\n")
-    process = RoleProcess(Role("replay", 0), run, 0, 1)
+    process = RoleProcess(Recipe(Role("replay", 0), run, 1), 0)
     assert ended(process) == 2
     result = process.poll()
     assert result is not None
@@ -183,7 +233,7 @@ def test_settings_that_a_role_cannot_use_are_the_line_that_a_person_reads(run: P
 
 def test_a_torn_snapshot_is_the_line_that_a_person_reads_and_no_reason_to_try_again(run: Path) -> None:
     (run / "replay" / "replay.snapshot").write_bytes(b"torn")
-    process = RoleProcess(Role("replay", 0), run, 0, 1)
+    process = RoleProcess(Recipe(Role("replay", 0), run, 1), 0)
     assert ended(process) == 2
     result = process.poll()
     assert result is not None
@@ -208,7 +258,9 @@ def test_a_role_takes_addresses_and_keys_from_its_leash_and_leaves_no_key_behind
     runs.create(tmp_path / "run", config)
     collector = ReportCollector("tcp://127.0.0.1:0", keys=keys, generation=9)
     orders = line_of(Addresses("", "", collector.address, reports_generation=9), keys.of_client())
-    process = RoleProcess(Role("evaluator", 0), tmp_path / "run", 0, 1, orders=orders, folder=tmp_path)
+    process = RoleProcess(
+        Recipe(Role("evaluator", 0), tmp_path / "run", 1, is_ordered=True, folder=tmp_path), 0, orders=orders
+    )
     try:
         reports: list[Report] = []
 
@@ -243,7 +295,9 @@ def test_a_port_in_use_is_tried_again_where_the_next_life_is_given_another_one(
         addresses = Addresses(address, "", f"ipc://{run / 'sockets' / 'reports'}")
         if not is_ordered:
             (run / "addresses.json").write_bytes(msgspec.json.encode(addresses))
-        process = RoleProcess(Role("replay", 0), run, 0, 1, orders=line_of(addresses) if is_ordered else None)
+        process = RoleProcess(
+            Recipe(Role("replay", 0), run, 1, is_ordered), 0, orders=line_of(addresses) if is_ordered else b""
+        )
         try:
             assert ended(process) == code
         finally:
@@ -254,7 +308,7 @@ def test_a_port_in_use_is_tried_again_where_the_next_life_is_given_another_one(
 
 
 def test_orders_that_a_dead_process_did_not_read_hinder_nobody_from_ending_it(run: Path) -> None:
-    process = RoleProcess(Role("replay", 0), run, 0, 1, cleans=False)
+    process = RoleProcess(Recipe(Role("replay", 0), run, 1), 0, cleans=False)
     left = run / "replay" / "replay.snapshot.writing"
     try:
         os.kill(process.pid, signal.SIGKILL)

@@ -21,7 +21,7 @@ from apex_bat.launching.cluster.kept import MOST_FAILED_STARTS, Kept, LostError,
 from apex_bat.launching.cluster.placed import Placed
 from apex_bat.launching.cluster.placement import ClusterError
 from apex_bat.launching.cluster.places import Places
-from apex_bat.launching.processes import remove_unfinished, threads_of
+from apex_bat.launching.processes import has_reserve, remove_unfinished, threads_of
 from apex_bat.roles.orders import line_of
 from apex_bat.roles.plan import Role
 from apex_bat.roles.process import ADDRESSES
@@ -175,6 +175,7 @@ class Fleet:
         kept.ask(
             "start", placed.life, role, kept.incarnation, threads_of(role, self._config),
             kept.flown_steps, line_of(addresses, keys),
+            has_reserve(role, self._config),
         )  # fmt: skip
         return True
 

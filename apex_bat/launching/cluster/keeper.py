@@ -19,7 +19,8 @@ from typing import NamedTuple
 
 import apex_bat
 from apex_bat.launching.cluster.lease import Lease, clock_s
-from apex_bat.launching.processes import RoleProcess
+from apex_bat.launching.processes import Recipe, RoleProcess
+from apex_bat.launching.reserve import Reserve
 from apex_bat.roles.plan import Role
 
 LOOK_S = 0.1
@@ -88,6 +89,7 @@ class Keeper:
         self._run, self._mark, self._address, self._base_port = Path(run), mark, address, base_port
         self._folder = Path(folder) if Path(folder).is_dir() else None
         self._process: RoleProcess | None = None
+        self._reserve: Reserve | None = None
         self._life = -1
         self._has_lapsed = False
         self._lease = Lease(lease_s, clock)
@@ -111,7 +113,10 @@ class Keeper:
         port = free_port(self._address, self._base_port, first_port(role)) if listens and not problem else 0
         return Site(socket.gethostname(), self._address, port, problem)
 
-    def start(self, life: int, role: Role, incarnation: int, num_threads: int, flown_steps: int, orders: bytes) -> int:
+    def start(
+        self, life: int, role: Role, incarnation: int, num_threads: int, flown_steps: int, orders: bytes,
+        has_reserve: bool = False,
+    ) -> int:  # fmt: skip
         """Starts the role and returns its pid; 0: nothing was started, because the lease has lapsed.
 
         A former process is killed first. A start that was long under way comes when the role has a place elsewhere.
@@ -123,6 +128,7 @@ class Keeper:
             num_threads: of linear algebra.
             flown_steps: environment steps of the whole run so far.
             orders: first line on its standard input.
+            has_reserve: whether a process is to wait here to take its place.
 
         Raises:
             OSError: it cannot be started.
@@ -132,8 +138,11 @@ class Keeper:
         if self._lease.has_lapsed:
             return 0
         _show_package_to_children()
+        recipe = Recipe(role, self._run, num_threads, is_ordered=True, folder=self._folder)
+        if has_reserve and self._reserve is None:
+            self._reserve = recipe.reserve()
         self._process = RoleProcess(
-            role, self._run, incarnation, num_threads, flown_steps, orders=orders, folder=self._folder,
+            recipe, incarnation, flown_steps, orders=orders, reserve=self._reserve,
             cleans=False,  # this may come when the role works elsewhere, and the folder is the same
         )  # fmt: skip
         self._life, self._has_lapsed = life, False
@@ -159,9 +168,10 @@ class Keeper:
         return Look(number, self._life, process.pid, True, ended.code or 0, detail)
 
     def stop(self) -> None:
-        """Asks the role to end."""
+        """Asks the role to end; it is not started again here."""
         if self._process is not None:
             self._process.stop()
+        self._close_reserve()
 
     def kill(self) -> None:
         """Ends the role at once."""
@@ -173,6 +183,11 @@ class Keeper:
         self._is_closed.set()
         self._thread.join()
         self.kill()
+        self._close_reserve()
+
+    def _close_reserve(self) -> None:
+        if self._reserve is not None:
+            self._reserve.close()
 
     def _watch_lease(self) -> None:
         """Kills the role when the lease lapses.

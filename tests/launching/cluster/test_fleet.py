@@ -72,7 +72,7 @@ class Host:
             self._port = 5000 + 100 * self.number + len(self.starts)
             return Site(f"host{self.number}", f"10.0.0.{self.number}", self._port, self.problem)
         if method == "start":
-            life, orders = given[0], given[-1]
+            life, orders = given[0], given[5]
             assert isinstance(life, int)
             self._life = life
             self.starts.append(_orders(orders))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +17,8 @@ import pytest
 import apex_bat
 from apex_bat.launching.cluster import keeper as module
 from apex_bat.launching.cluster.keeper import MARK, NUM_PORTS, Keeper, first_port, free_port, versions_here
+from apex_bat.launching.processes import Recipe
+from apex_bat.launching.reserve import Reserve
 from apex_bat.launching.supervisor import Exit
 from apex_bat.roles.plan import Role
 
@@ -26,11 +30,10 @@ class Process:
 
     made: list[Process]
 
-    def __init__(
-        self, role: Role, run: Path, incarnation: int, num_threads: int, flown_steps: int, **more: Any
-    ) -> None:
-        self.given = (role, run, incarnation, num_threads, flown_steps)
-        self.told, self.folder, self.cleans = [more["orders"]], more["folder"], more["cleans"]
+    def __init__(self, recipe: Recipe, incarnation: int, flown_steps: int, **more: Any) -> None:
+        self.given = (recipe.role, recipe.run, incarnation, recipe.num_threads, flown_steps)
+        self.told, self.folder, self.cleans = [more["orders"]], recipe.folder, more["cleans"]
+        self.reserve: Reserve | None = more["reserve"]
         self.ended: Exit | None = None
         self.is_killed = threading.Event()
         self.pid = 100 + len(self.made)
@@ -101,6 +104,28 @@ def test_a_role_is_started_told_and_looked_at(make: Make, tmp_path: Path) -> Non
     process.ended = Exit(3, "it broke")
     look = keeper.look(look.number)
     assert (look.has_ended, look.code, look.detail) == (True, 3, "it broke")
+
+
+def test_a_role_has_a_reserve_where_one_is_asked_for_until_it_is_to_end(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits = [sys.executable, "-c", "import sys; sys.stdin.read()"]
+    monkeypatch.setattr(Recipe, "start", lambda *_: subprocess.Popen(waits, stdin=subprocess.PIPE))
+    keeper = make()
+    keeper.start(1, ACTOR, 7, 1, 500, b"first\n", True)
+    keeper.start(2, ACTOR, 8, 1, 500, b"first\n", True)
+    first, second = (process.reserve for process in Process.made)
+    assert first is not None
+    assert first is second
+    first.tend()
+    waiting = first._process
+    assert waiting is not None
+    keeper.kill()
+    assert waiting.poll() is None, "it is for the next life"
+    keeper.stop()
+    assert waiting.poll() == 0
+    start(make())
+    assert Process.made[-1].reserve is None
 
 
 def test_a_second_start_ends_the_first_process(make: Make) -> None:

@@ -203,14 +203,14 @@ def kill_launcher(folder: Path, options: Options) -> dict[str, Any]:
     run = Run(folder, options, 5.0)
     try:
         run.wait_for_flow(START_S)
-        pids = [pid for pid in map(run.pid, run.roles()) if pid is not None]
+        has_children = len(chaos_report.processes_of(folder)) > 1
         run.process.kill()
         run.process.wait()
         killed_s = time.time()
-        while any(began_unix_s(pid) is not None for pid in pids) and time.time() < killed_s + 60.0:
+        while chaos_report.processes_of(folder) and time.time() < killed_s + 60.0:
             time.sleep(LOOK_S)
         return {
-            "roles_ended_after_s": round(time.time() - killed_s, 2) if pids else float("nan"),
+            "roles_ended_after_s": round(time.time() - killed_s, 2) if has_children else float("nan"),
             "processes": chaos_report.processes_of(folder),
             "leftovers": chaos_report.leftovers_of(folder, run.process.pid),
         }

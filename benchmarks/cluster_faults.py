@@ -5,8 +5,8 @@
 `cluster_netns.sh` makes a head and two workers of Linux namespaces, each with an address, process numbers and /tmp of
 its own, joined by a switch without up-link, and starts Ray on them. A run begins whose replay and learner must be on
 workers; then a role is killed, a raylet is killed, and a worker is cut off and joined again: with Ray's default health
-check and with a tuned one. Needs root, iproute2 and util-linux. Takes about 5 minutes, and kills only
-what it started.
+check and with a tuned one. At last all processes of the head are killed, the launcher with them; it is switched on
+again and the run resumed. Needs root, iproute2 and util-linux. Takes about 6 minutes, and kills only what it started.
 
 Recovery is the time from the fault until the replaced role reports from its new process and the learner's step has
 grown since: somebody who watches `apex-bat status` sees no earlier sign. It includes up to a second each of the reports
@@ -35,6 +35,7 @@ TUNED = (
     '"health_check_timeout_ms":2000,"health_check_failure_threshold":3}'
 )
 TARGET_S = {"killed role": 5.0, "killed raylet": 20.0, "cut off, default": 75.0, "cut off, tuned": 15.0}
+HEAD_LOST = "head lost, then `--resume`"
 SETTINGS = (
     "actors=3", "bats_per_actor=4", "replay.min_size=500", "replay.capacity=50_000", "learner.batch_size=16",
     "network.channels=[4]", "network.strides=[3]", "network.hidden=[16]", "evaluation.flights=1",
@@ -52,8 +53,8 @@ class Outcome(NamedTuple):
     fault: str
     role: str
     recovered_s: float
-    """From the fault until the role works elsewhere or anew."""
-    target_s: float
+    """From the fault until the role works elsewhere or anew; where the head was lost, from the command that resumes."""
+    target_s: float | None
     old_ended_s: float | None
     """From the fault until the old process was gone; None where the fault itself ended it."""
     lease_s: float
@@ -64,11 +65,11 @@ class Outcome(NamedTuple):
 class Network:
     """Hosts in namespaces, by the script beside this file."""
 
-    def __init__(self, folder: Path, health: str | None) -> None:
+    def __init__(self, folder: Path, health: str | None, head: str, worker: str) -> None:
         self.shared = folder / "shared"
         self._environment = os.environ | {
             "RC_PY": sys.executable, "RC_DIR": str(folder), "RC_CPUS": "4", "RC_DASHBOARD": "0",
-            "RC_RES_HEAD": '{"head":1}', "RC_RES_WORKER": '{"server":2}', "RC_PREFIX": "ab", "RC_NET": "10.87.0",
+            "RC_RES_HEAD": head, "RC_RES_WORKER": worker, "RC_PREFIX": "ab", "RC_NET": "10.87.0",
             "RAY_worker_niceness": "0",
         }  # fmt: skip
         if health is not None:
@@ -107,10 +108,16 @@ class Run:
         network.shared.mkdir(parents=True, exist_ok=True)
         settings = [word for one in (*SETTINGS, f"cluster.lease_s={lease_s}") for word in ("--set", one)]
         self.log = self.folder.with_suffix(".log")
-        self.process = network.begin(
-            sys.executable, "-m", "apex_bat", "train", "--cluster", "auto", "--plain",
-            "--run", str(self.folder), *settings, log=self.log,
-        )  # fmt: skip
+        self.process = self._begin("--run", str(self.folder), *settings)
+
+    def resume(self) -> None:
+        """Goes on with a run whose launcher has died."""
+        self.process.wait()
+        self.process = self._begin("--resume", str(self.folder))
+
+    def _begin(self, *words: str) -> subprocess.Popen[bytes]:
+        command = (sys.executable, "-m", "apex_bat", "train", "--cluster", "auto", "--plain", *words)
+        return self.network.begin(*command, log=self.log)
 
     def roles(self) -> dict[str, dict[str, Any]]:
         """Returns the rows of status.json by role."""
@@ -166,6 +173,7 @@ def main() -> None:
     if given.only != "default":
         with hosts(given.folder, TUNED) as network, running(network, lease_s=5.0) as run:
             outcomes.append(cut(run, "cut off, tuned"))
+            outcomes.append(without_head(run))
     content = {
         "load": load,
         "settings": list(SETTINGS),
@@ -188,15 +196,18 @@ def table(content: dict[str, Any]) -> str:
     ]
     for one in content["faults"]:
         gone = "" if one["old_ended_s"] is None else f"{one['old_ended_s']:.1f}, lease {one['lease_s']:g}"
-        lines.append(f"| {one['fault']} | {one['role']} | {one['recovered_s']:.1f} | {one['target_s']:g} | {gone} |")
+        target = "" if one["target_s"] is None else f"{one['target_s']:g}"
+        lines.append(f"| {one['fault']} | {one['role']} | {one['recovered_s']:.1f} | {target} | {gone} |")
     lines.append(f"\nLoad of the machine by others before: {content['load']:.1f} on {content['cores']} cores.")
     return "\n".join(lines) + "\n"
 
 
 @contextmanager
-def hosts(folder: Path, health: str | None) -> Iterator[Network]:
-    """Yields a network of a head and two workers with Ray, and ends it."""
-    network = Network(folder, health)
+def hosts(
+    folder: Path, health: str | None, *, head: str = '{"head":1}', worker: str = '{"server":2}'
+) -> Iterator[Network]:
+    """Yields a network of a head and two workers with Ray and their custom resources, and ends it."""
+    network = Network(folder, health, head, worker)
     made = network.do("up", "2")
     try:
         if made.returncode:
@@ -251,6 +262,39 @@ def cut(run: Run, fault: str) -> Outcome:
     run.learns()
     if run.network.lives(host, before["pid"]):
         raise SystemExit("the old replay lives again")
+    return outcome
+
+
+def without_head(run: Run) -> Outcome:
+    """Kills all processes of the head, with the launcher; switches it on again and resumes when the roles are gone."""
+    before = run.roles()
+    places = {(_host(row), row["pid"]) for row in before.values() if _host(row) != "head"}
+    run.network.do("kill", "head")
+    begun_s = time.monotonic()
+    while any(run.network.lives(host, pid) for host, pid in places):
+        if time.monotonic() - begun_s > LIMIT_S:
+            raise SystemExit("roles outlive the head of their cluster")
+        time.sleep(0.1)
+    old_ended_s = time.monotonic() - begun_s
+    run.network.do("boot", "head")
+    for host in sorted({host for host, _ in places}):  # what they run knows the former head only
+        run.network.do("ray-stop", host)
+        run.network.do("ray-start", host)
+    begun_s = time.monotonic()
+    run.resume()
+    learner = before["learner"]
+
+    def is_resumed(roles: dict[str, dict[str, Any]]) -> bool:
+        row = roles.get("learner")
+        return row is not None and (_host(row), row["pid"]) not in places and _is_at_work(row)
+
+    run.until(is_resumed, "it is resumed")
+    run.learns()
+    outcome = Outcome(
+        HEAD_LOST, "learner", round(time.monotonic() - begun_s, 1), None, round(old_ended_s, 1), run.lease_s,
+        learner["host"], run.roles()["learner"]["host"],
+    )  # fmt: skip
+    print(json.dumps(outcome._asdict()), flush=True)
     return outcome
 
 

@@ -63,7 +63,7 @@ class Learner(Section, frozen=True):
     """Soft update: share of the online network taken over after each update (thesis: 0.001)."""
     averaged_updates: CountOrZero = 1_500
     """Updates over which the parameters are averaged, exponentially, into the policy that is judged, recorded and kept
-    as the best; 0: that is the online network itself. Actors always fly with the online network."""
+    as the best; at first over a tenth of the updates so far. 0: no average. Actors fly with the online network."""
     mirror: bool = True
     """Whether half of each batch is mirrored: left for right in ears and turns."""
     weights_period: Count = 25

@@ -56,6 +56,7 @@ class Course:
         origin: Origin,
         part: int,
         more: Callable[[], Sequence[Role]] = tuple,
+        tend: Callable[[], None] = lambda: None,
     ) -> None:
         """Takes what the run is made of; nothing is started yet.
 
@@ -67,9 +68,10 @@ class Course:
             origin: what earlier parts of a resumed run have done.
             part: how often the run was resumed.
             more: returns further roles for which there is room now; asked once a second.
+            tend: looks after what the roles need besides; called as often, while the run goes on.
         """
         self._config, self._run, self._collector = config, run, collector
-        self._start_role, self._part, self._more = start, part, more
+        self._start_role, self._part, self._more, self._tend = start, part, more, tend
         self._supervisor = Supervisor(roles_of(config), self._start, config.launch)
         self._standing = Standing(config, time.monotonic(), origin)
         self._metrics: MetricsWriter | None = None
@@ -97,7 +99,7 @@ class Course:
             while not (self._standing.is_over or self._supervisor.is_done("learner")):
                 self._take_reports(0.1)
                 self._supervisor.watch(self._standing.now_s)
-                self._grow()
+                self._tend_and_grow()
                 view.show(self._standing, self._supervisor.watched)
         except KeyboardInterrupt:
             return "interrupted", "interrupted"
@@ -136,10 +138,11 @@ class Course:
     def _start(self, role: Role, restarts: int) -> Handle:
         return self._start_role(role, incarnation_of(self._part, restarts), int(self._standing.env_steps))
 
-    def _grow(self) -> None:
+    def _tend_and_grow(self) -> None:
         if self._standing.now_s < self._growth_due_s:
             return
         self._growth_due_s = self._standing.now_s + GROWTH_PERIOD_S
+        self._tend()
         for role in self._more():
             self._collector.admit(role.name)
             self._standing.add(role)

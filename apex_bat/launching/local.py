@@ -61,10 +61,17 @@ def train(
                 if has_reserve(role, config)
             }
 
-            def start(role: Role, incarnation: int, flown_steps: int) -> RoleProcess:
-                return RoleProcess(recipes[role], incarnation, flown_steps, reserve=reserves.get(role))
+            newest: dict[Role, RoleProcess] = {}
 
-            return Course(config, run, collector, start, origin, part).go(view)
+            def start(role: Role, incarnation: int, flown_steps: int) -> RoleProcess:
+                newest[role] = RoleProcess(recipes[role], incarnation, flown_steps, reserve=reserves.get(role))
+                return newest[role]
+
+            def tend() -> None:
+                for process in newest.values():
+                    process.tend_reserve()
+
+            return Course(config, run, collector, start, origin, part, tend=tend).go(view)
 
 
 def heeded(*names: str) -> list[signal.Signals]:

@@ -128,14 +128,23 @@ class RoleProcess:
         """Returns how it ended, with the last line of its log, or None while it runs."""
         code = self._process.poll()
         if code is None:
-            if self._reserve is not None and time.monotonic() - self._begun_s > AFTER_S:
-                self._reserve.tend()
             return None
         self._clean()
         return Exit(code, last_line(self._recipe.log))
 
+    def tend_reserve(self) -> None:
+        """Has a process in reserve once this one has worked for a while."""
+        if self._reserve is not None and time.monotonic() - self._begun_s > AFTER_S and self._process.poll() is None:
+            self._reserve.tend()
+
     def stop(self) -> None:
-        """Asks it to save and end: lets go of the leash."""
+        """Asks it to save and end, and lets its reserve go: there will be no other."""
+        if self._reserve is not None:
+            self._reserve.let_go()
+        self._let_go()
+
+    def _let_go(self) -> None:
+        """Lets go of the leash."""
         if self._recipe.is_ordered:
             self.tell(STOP)
         if self._process.stdin is not None and not self._process.stdin.closed:
@@ -144,7 +153,7 @@ class RoleProcess:
 
     def kill(self) -> None:
         """Ends it at once and waits for it, for a moment; whether it is gone `poll` says."""
-        self.stop()
+        self._let_go()
         self._process.kill()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(KILL_TIMEOUT_S)

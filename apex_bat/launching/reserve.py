@@ -8,9 +8,13 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
+import psutil
+
 _log = logging.getLogger(__name__)
 AFTER_S = 10.0
 """How long a role has worked before a process is prepared: the start of a run has other use for the cores."""
+MOST_WAIT_S = 600.0
+"""Between two attempts, where each process dies: the machine may be short of memory."""
 CLOSE_S = 2.0
 """How long the process may take to see that it is not needed; one that still imports is killed."""
 
@@ -24,47 +28,72 @@ class Reserve:
         """`start` starts such a process; it is called when `tend` finds none."""
         self._start, self._clock = start, clock
         self._process: subprocess.Popen[bytes] | None = None
-        self._tried_s = float("-inf")
+        self._due_s, self._wait_s = clock(), AFTER_S
+        self._is_over = False
 
     def tend(self) -> None:
-        """Starts a process if there is none; where the machine cannot, tries again after `AFTER_S`."""
-        if self._process is not None and self._process.poll() is None:
+        """Starts a process if there is none; after one that died, or could not be started, not at once."""
+        if self._is_over:
             return
-        if self._clock() - self._tried_s < AFTER_S:
+        if self._process is not None:
+            if self._process.poll() is None:
+                return
+            self._miss(f"ended with exit code {self._process.returncode}")
+        if self._clock() < self._due_s:
             return
-        self._tried_s = self._clock()
-        self._release()
         try:
             self._process = self._start()
         except OSError as error:
-            _log.warning("no process in reserve: %s", error.strerror or error)
+            self._miss(error.strerror or str(error))
 
     def take(self) -> subprocess.Popen[bytes] | None:
-        """Hands the process over; None if there is none, or it has ended."""
-        process, self._process = self._process, None
-        if process is not None and process.poll() is not None:
-            _let_go(process)
-            return None
-        return process
-
-    def close(self) -> None:
-        """Ends the process. May be called twice."""
-        self._release()
-
-    def _release(self) -> None:
+        """Hands the process over; None if there is none, or it has ended or was stopped by a signal."""
         process, self._process = self._process, None
         if process is None:
-            return
-        _let_go(process)
-        try:
-            process.wait(CLOSE_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(CLOSE_S)
+            return None
+        if process.poll() is None and not _is_stopped(process.pid):
+            self._due_s, self._wait_s = self._clock(), AFTER_S
+            return process
+        process.kill()
+        _release(process)
+        return None
+
+    def let_go(self) -> None:
+        """Lets the process end, and starts no other; returns at once."""
+        self._is_over = True
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):
+                self._process.stdin.close()
+
+    def close(self) -> None:
+        """Ends the process, and starts no other. May be called twice."""
+        self.let_go()
+        process, self._process = self._process, None
+        if process is not None:
+            _release(process)
+
+    def _miss(self, reason: str) -> None:
+        _log.warning("the process in reserve: %s; another one is tried in %g s", reason, self._wait_s)
+        if self._process is not None:
+            _release(self._process)
+        self._process = None
+        self._due_s, self._wait_s = self._clock() + self._wait_s, min(2.0 * self._wait_s, MOST_WAIT_S)
 
 
-def _let_go(process: subprocess.Popen[bytes]) -> None:
+def _release(process: subprocess.Popen[bytes]) -> None:
+    """Waits for a process that was let go, and kills one that does not see it."""
     if process.stdin is not None:
         with suppress(OSError):
             process.stdin.close()
+    try:
+        process.wait(CLOSE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(CLOSE_S)
+
+
+def _is_stopped(pid: int) -> bool:
+    with suppress(psutil.Error):
+        return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)
+    return True

@@ -18,6 +18,7 @@ from apex_bat.agent.inference import Policy, PolicyValues, initial_parameters, p
 from apex_bat.agent.n_step import Accumulator
 from apex_bat.experience import Chunk, States
 from apex_bat.replay.client import TurnWriter
+from apex_bat.roles import checkpoint
 from apex_bat.roles.episodes import EpisodeRecorder
 from apex_bat.roles.lines import ExperienceSink, WeightsSource
 from apex_bat.roles.plan import Assignment
@@ -87,7 +88,8 @@ class Actor:
             for _ in range(config.bats_per_actor)
         ]
         self._policy = Policy(config.network, config.state_steps)
-        self._begins_the_run = assignment.begins_the_run
+        # One that joins late, or is started by hand, may have been told nothing of what the run has done.
+        self._begins_the_run = assignment.begins_the_run and not checkpoint.find(assignment.run / "checkpoints")
         self._learner_step = -1
         self._parameters: dict[str, NDArray[np.float32]] = {}
         self._phases = Phases("simulation", "policy", "gathering", clock=assignment.clock)

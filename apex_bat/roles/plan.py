@@ -114,7 +114,7 @@ class Assignment(NamedTuple):
 
     @property
     def begins_the_run(self) -> bool:
-        """Whether nothing of the run was flown, and so nothing learnt, when this role was started."""
+        """Whether, by what this role was told, nothing of the run was flown before it was first started."""
         return self.incarnation == 0 and self.flown_steps == 0
 
     @property

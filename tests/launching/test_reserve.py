@@ -1,6 +1,8 @@
 """Processes in reserve, with one in the place of a role that does nothing until its standard input ends."""
 
 import errno
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -55,16 +57,44 @@ def test_one_process_waits_and_is_handed_over_once(reserve: Reserve, starts: Sta
     assert starts.made[0].poll() is None
 
 
-def test_one_that_has_died_is_replaced_but_not_at_once_and_never_handed_over(reserve: Reserve, starts: Starts) -> None:
+def test_those_that_die_are_replaced_ever_more_slowly_and_never_handed_over(
+    reserve: Reserve, starts: Starts, caplog: pytest.LogCaptureFixture
+) -> None:
+    for wait_s in (AFTER_S, 2.0 * AFTER_S, 4.0 * AFTER_S):
+        num_made = len(starts.made)
+        reserve.tend()
+        assert len(starts.made) == num_made + 1
+        starts.made[-1].kill()
+        starts.made[-1].wait()
+        reserve.tend()
+        assert f"another one is tried in {wait_s:g} s" in caplog.text
+        starts.now_s += 0.9 * wait_s
+        reserve.tend()
+        assert len(starts.made) == num_made + 1
+        assert reserve.take() is None
+        starts.now_s += 0.1 * wait_s
     reserve.tend()
-    starts.made[0].kill()
-    starts.made[0].wait()
+    assert reserve.take() is starts.made[-1]
+    reserve.tend()
+    assert len(starts.made) == 5, "one that was of use counts for nothing against the next"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX")
+def test_one_that_was_stopped_is_killed_instead_of_handed_over(reserve: Reserve, starts: Starts) -> None:
+    reserve.tend()
+    os.kill(starts.made[0].pid, signal.SIGSTOP)
+    os.waitpid(starts.made[0].pid, os.WUNTRACED)
+    assert reserve.take() is None
+    assert starts.made[0].poll() == -signal.SIGKILL
+
+
+def test_after_the_end_was_asked_for_none_is_started(reserve: Reserve, starts: Starts) -> None:
+    reserve.tend()
+    reserve.let_go()
+    assert starts.made[0].wait(10.0) == 0
+    starts.now_s = 1e6
     reserve.tend()
     assert len(starts.made) == 1
-    assert reserve.take() is None
-    starts.now_s = AFTER_S
-    reserve.tend()
-    assert reserve.take() is starts.made[1]
 
 
 def test_a_machine_that_cannot_start_one_is_asked_again_later(
@@ -72,7 +102,7 @@ def test_a_machine_that_cannot_start_one_is_asked_again_later(
 ) -> None:
     starts.error = OSError(errno.ENOMEM, "Cannot allocate memory")
     reserve.tend()
-    assert "no process in reserve: Cannot allocate memory" in caplog.text
+    assert "the process in reserve: Cannot allocate memory" in caplog.text
     starts.error = None
     reserve.tend()
     assert not starts.made
@@ -94,4 +124,4 @@ def test_what_does_not_see_that_it_is_not_needed_is_killed(monkeypatch: pytest.M
     reserve = Reserve(lambda: deaf)
     reserve.tend()
     reserve.close()
-    assert deaf.poll() == -9
+    assert deaf.poll() not in (None, 0)

@@ -57,10 +57,10 @@ class Flying:
             self.actor.step()
 
 
-def lone_actor(config: Config, stack: ExitStack, incarnation: int, flown_steps: int) -> Actor:
+def lone_actor(config: Config, stack: ExitStack, incarnation: int, flown_steps: int, run: Path = Path()) -> Actor:
     """An actor whose learner has broadcast nothing yet."""
     stop, nowhere = threading.Event(), Addresses("", "", "")
-    assignment = Assignment(Role("actor", 0), config, Path(), nowhere, stop, incarnation, flown_steps, lambda: 0.0)
+    assignment = Assignment(Role("actor", 0), config, run, nowhere, stop, incarnation, flown_steps, lambda: 0.0)
     sink = StoreSink(ReplayStore(config, np.random.default_rng(0)), "actor-0")
     reporter = RoleReporter(assignment, resources=dict, line=Dropped())
     return stack.enter_context(closing(Actor(assignment, sink, BoardReader(WeightsBoard()), reporter)))
@@ -82,6 +82,15 @@ def test_an_actor_of_a_new_run_flies_before_there_is_a_learner_and_with_its_firs
 def test_an_actor_of_a_run_that_has_learnt_waits_for_its_learner(incarnation: int, flown_steps: int) -> None:
     with ExitStack() as stack:
         assert not lone_actor(load(None, list(SMALL)), stack, incarnation, flown_steps).is_ready(0.0)
+
+
+def test_an_actor_that_was_told_nothing_sees_by_a_checkpoint_that_the_run_has_learnt(tmp_path: Path) -> None:
+    config = load(None, list(SMALL))
+    with ExitStack() as stack:
+        assert lone_actor(config, stack, 0, 0, tmp_path).is_ready(0.0)
+        (tmp_path / "checkpoints").mkdir()
+        (tmp_path / "checkpoints" / "step-000000007.npz").touch()
+        assert not lone_actor(config, stack, 0, 0, tmp_path).is_ready(0.0)
 
 
 def test_an_actor_that_is_held_back_keeps_saying_that_it_wants_weights(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -195,13 +195,24 @@ def test_a_line_that_begins_no_life_is_named(run: Path) -> None:
     assert "a line of 3 bytes begins no life" in (run / "logs" / "replay.log").read_text()
 
 
-def test_a_working_role_has_its_reserve_tended(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("apex_bat.launching.processes.AFTER_S", 0.0)
+def test_a_role_has_a_process_in_reserve_while_it_works_and_none_once_it_is_to_end(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recipe = Recipe(Role("replay", 0), run, 1)
     reserve = recipe.reserve()
     process = RoleProcess(recipe, 0, reserve=reserve)
     try:
-        eventually(lambda: process.poll() is None and reserve._process is not None, 10.0, "one is in reserve")
+        process.tend_reserve()
+        assert reserve._process is None, "the start of a run has other use for the cores"
+        monkeypatch.setattr("apex_bat.launching.processes.AFTER_S", 0.0)
+        process.tend_reserve()
+        assert reserve._process is not None
+        process.stop()
+        assert reserve._process.wait(30.0) == 0
+        process.tend_reserve()
+        assert ended(process) == 0
+        process.tend_reserve()
+        assert reserve._process.poll() == 0
     finally:
         process.kill()
         reserve.close()

@@ -163,6 +163,7 @@ class Keeper:
             process.tell(orders)
         ended = process.poll()
         if ended is None:
+            process.tend_reserve()
             return Look(number, self._life, process.pid, False, 0, "")
         detail = "its host had not heard the launcher for the lease" if self._has_lapsed else ended.detail
         return Look(number, self._life, process.pid, True, ended.code or 0, detail)
@@ -171,7 +172,6 @@ class Keeper:
         """Asks the role to end; it is not started again here."""
         if self._process is not None:
             self._process.stop()
-        self._close_reserve()
 
     def kill(self) -> None:
         """Ends the role at once."""
@@ -183,9 +183,6 @@ class Keeper:
         self._is_closed.set()
         self._thread.join()
         self.kill()
-        self._close_reserve()
-
-    def _close_reserve(self) -> None:
         if self._reserve is not None:
             self._reserve.close()
 

@@ -45,8 +45,14 @@ class Process:
     def tell(self, orders: bytes) -> None:
         self.told.append(orders)
 
+    def tend_reserve(self) -> None:
+        if self.reserve is not None:
+            self.reserve.tend()
+
     def stop(self) -> None:
         self.ended = Exit(0, "")
+        if self.reserve is not None:
+            self.reserve.let_go()
 
     def kill(self) -> None:
         self.ended = self.ended or Exit(-9, "")
@@ -117,13 +123,13 @@ def test_a_role_has_a_reserve_where_one_is_asked_for_until_it_is_to_end(
     first, second = (process.reserve for process in Process.made)
     assert first is not None
     assert first is second
-    first.tend()
+    keeper.look(0)
     waiting = first._process
     assert waiting is not None
     keeper.kill()
     assert waiting.poll() is None, "it is for the next life"
     keeper.stop()
-    assert waiting.poll() == 0
+    assert waiting.wait(10.0) == 0
     start(make())
     assert Process.made[-1].reserve is None
 

@@ -43,6 +43,7 @@ SETTINGS = (
     "recording.every_episodes=0", "recording.curves=false", "train.max_minutes=60", "cluster.role_cpus=0.5",
     "cluster.replay_resource=server", "cluster.learner_resource=server",
 )  # fmt: skip
+SETTLED_S = 20.0  # before the first fault: the process in reserve for the learner imports meanwhile
 LIMIT_S = 150.0
 BEGIN, END = "<!-- faults: begin -->", "<!-- faults: end -->"
 
@@ -224,6 +225,7 @@ def running(network: Network, lease_s: float) -> Iterator[Run]:
     run = Run(network, lease_s)
     try:
         run.learns()
+        time.sleep(SETTLED_S)
         yield run
     finally:
         run.end()

@@ -155,7 +155,8 @@ class Fleet:
         placed = kept.placed
         if kept.is_lost or (kept.hearing.heard_s is None and kept.site is None):
             return
-        is_ready = kept.site is not None and not kept.is_useless and bool(placed.waiting) and not placed.is_over
+        is_ready = kept.site is not None and not kept.is_useless and bool(placed.waiting)
+        is_ready = is_ready and not (placed.is_lost or placed.is_over)
         if is_ready and self._begin(kept, placed):
             kept.look_due_s = now_s + LOOK_S
         elif now_s >= kept.look_due_s and all(method != "look" for method, _ in kept.under_way.values()):
@@ -202,6 +203,7 @@ class Fleet:
                 kept.dismiss()  # it may only be out of reach
             kept.is_lost = True
             placed.take_loss(str(answer))
+            self._replace(kept)
         elif isinstance(answer, Look):
             kept.hearing.take(time.monotonic(), answer.number)
             placed.take_look(answer)
@@ -211,11 +213,27 @@ class Fleet:
             return
         elif isinstance(answer, Exception):
             self._take_error(kept, placed, method, answer)
+        elif isinstance(answer, Site) and placed.is_lost:  # a place in advance: the next life asks again
+            kept.site = answer
+            kept.hearing.take(time.monotonic())
         elif isinstance(answer, Site):
             self._take_site(kept, placed, answer)
         elif method == "start" and isinstance(answer, int):
             kept.failed_starts = 0
             placed.take_start(answer)
+
+    def _replace(self, kept: Kept) -> None:
+        """Asks for the next place at once, while what was started on a lost keeper may still be ending.
+
+        To find a place and start a keeper there takes seconds. Nothing is started in it before the next life begins,
+        which the supervisor asks for when the former one is over.
+        """
+        placed = kept.placed
+        if kept.role.kind == "actor" or placed.is_over or self._kept.get(kept.role.name) is not kept:
+            return
+        fresh = Kept(kept.role, self._config.cluster.lease_s, time.monotonic())
+        fresh.placed = placed
+        self._kept[kept.role.name] = fresh
 
     def _take_error(self, kept: Kept, placed: Placed, method: str, error: Exception) -> None:
         placed.take_error(error)

@@ -95,6 +95,11 @@ class Placed:
         self._hearing.take_loss(self._clock())
 
     @property
+    def is_lost(self) -> bool:
+        """Whether its keeper is gone; what was started on it may still be ending."""
+        return bool(self._lost)
+
+    @property
     def is_over(self) -> bool:
         """Whether it has ended or is given up."""
         return self.poll() is not None

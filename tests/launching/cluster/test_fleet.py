@@ -204,6 +204,40 @@ def test_a_role_on_a_lost_host_gets_another_place(fleet: Fleet, stage: Stage) ->
     assert stage.hosts[2].is_dismissed
 
 
+def test_the_next_place_of_a_lost_server_is_found_while_the_former_life_may_still_be_ending(
+    fleet: Fleet, stage: Stage
+) -> None:
+    first = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER, ACTOR)]
+    until(lambda: all(each.pid for each in first))
+    stage.hosts[0].is_lost = True
+    until(lambda: len(stage.hosts) == 4 and fleet._kept["replay"].site is not None)
+    assert first[0].poll() is None, "an orphan has a second for its last files"
+    until(first[0].poll)
+    assert not stage.hosts[3].starts
+    again = fleet.start(REPLAY, 1, 0)
+    until(lambda: again.pid)
+    assert len(stage.hosts[3].starts) == 1
+    assert len(stage.hosts) == 4
+    until(lambda: stage.hosts[1].news)
+    replay = stage.hosts[1].news[-1].addresses.replay
+    assert replay.startswith("tcp://10.0.0.4:"), "the others hear of the place in which it lives"
+
+
+def test_a_place_in_advance_that_is_lost_as_well_is_replaced(fleet: Fleet, stage: Stage) -> None:
+    first = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER)]
+    until(lambda: all(each.pid for each in first))
+
+    def lose(host: Host) -> None:
+        host.is_lost = len(stage.hosts) == 2
+
+    stage.prepare = lose
+    stage.hosts[0].is_lost = True
+    until(first[0].poll)
+    again = fleet.start(REPLAY, 1, 0)
+    until(lambda: again.pid)
+    assert len(stage.hosts[-1].starts) == 1
+
+
 def test_a_silent_host_counts_as_lost_after_the_lease_and_not_before(fleet: Fleet, stage: Stage) -> None:
     first = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER)]
     until(lambda: all(each.pid for each in first))

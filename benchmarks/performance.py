@@ -49,6 +49,7 @@ TARGETS: tuple[Target, ...] = (
     Target("learner on the real server, in rates of in-memory batches", "learner.relative_updates", 0.9, True),
     Target("idle share of the learner", "learner.idle_share", 0.05, False),
     Target("recording, share of an actor's steps/s", "recording.overhead", 0.05, False),
+    Target("from `train` to the first environment step [s]", "system.first_step_s", 5, False),
 )
 
 

@@ -24,6 +24,19 @@ def test_every_fault_was_measured_and_a_role_that_was_cut_off_ended_within_its_l
     assert all(one["from_host"] != one["to_host"] for one in cut)
 
 
+def test_the_training_across_hosts_is_that_of_the_result() -> None:
+    result = json.loads((ROOT / "docs" / "results" / "cluster_training.json").read_text(encoding="utf-8"))
+    training, text = result["training"], " ".join(PAGE.split())
+    assert (
+        f"{training['env_steps']:,} steps and {training['learner_steps']:,} updates in {result['minutes']} minutes"
+        in text
+    )
+    simple, narrow, circle = (row["completed"] for row in result["summary"])
+    assert f"completes {simple} of 15 flights in simple, {narrow} in narrow and {circle} in circle" in text
+    assert result["hosts"]["replay"] != result["hosts"]["learner"]
+    assert result["hosts"]["actor-0"] != result["hosts"]["actor-1"]
+
+
 def test_settings_and_files_that_the_page_names_exist() -> None:
     settings = set(re.findall(r"(?<![-_/a-z])cluster[.]([a-z_]+)", PAGE))
     assert settings <= set(Config().cluster.__struct_fields__)

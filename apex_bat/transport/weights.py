@@ -234,7 +234,7 @@ class WeightsSubscriber:
         """Waits until something has come, up to `timeout_s`; returns whether it has.
 
         Raises:
-            TransportError: the connection is given up.
+            TransportError: the connection is given up, also because the publisher refused our keys.
         """
         self._subscribe()
         return bool(self._connection.socket.poll(int(timeout_s * 1000)))
@@ -251,6 +251,7 @@ class WeightsSubscriber:
             try:
                 self._connection.socket.send(encode(Subscription(*self._last), self._generation), zmq.NOBLOCK)
             except zmq.Again:  # a DEALER that conflates has room as long as it has a connection, or makes one
+                self._connection.check()  # it gives up where the handshake breaks the protocol, too
                 raise TransportError(
                     f"{self._connection.address}: the connection for weights was given up: "
                     "they may be larger than transport.max_message_mb"

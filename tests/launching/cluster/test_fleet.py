@@ -349,7 +349,7 @@ def test_a_keeper_that_cannot_start_its_role_three_times_is_dismissed(method: st
         assert ended.code is None, "it may pass by itself"
         assert "Cannot allocate memory" in ended.detail
         assert learner.poll() is None
-    assert stage.hosts[0].is_dismissed
+    until(lambda: stage.hosts[0].is_dismissed)  # a moment after the role is told
     again = fleet.start(REPLAY, MOST_FAILED_STARTS, 0)
     until(lambda: again.pid)
     assert len([host for host in stage.hosts if host.role is REPLAY]) == 2

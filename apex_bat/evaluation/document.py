@@ -62,7 +62,8 @@ h3 { font-size: 1.05rem; margin-top: 1.6rem; }
 table { border-collapse: collapse; font-size: .86rem; font-variant-numeric: tabular-nums; margin: .6rem 0; }
 caption { caption-side: top; text-align: left; color: #444; padding-bottom: .3rem; }
 th, td { padding: .22rem .7rem .22rem 0; text-align: right; vertical-align: top; border-bottom: 1px solid #ddd; }
-th { border-bottom: 2px solid #555; } td { white-space: nowrap; } td:last-child { white-space: normal; }
+th { border-bottom: 2px solid #555; } td { white-space: nowrap; } td.left, td:last-child { white-space: normal; }
+td.left:last-child { min-width: 14rem; }
 .left { text-align: left; }
 figure { margin: 1.4rem 0; } img { max-width: 100%; height: auto; } figcaption { color: #444; font-size: .9rem; }
 @media print { body { max-width: none; margin: 0; } figure, tr { break-inside: avoid; } }

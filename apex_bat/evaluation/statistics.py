@@ -102,7 +102,7 @@ def wilson_interval(count: float, total: int) -> tuple[float, float]:
     share = count / total
     middle = (share + z**2 / (2 * total)) / (1 + z**2 / total)
     half = z / (1 + z**2 / total) * np.sqrt(share * (1 - share) / total + z**2 / (4 * total**2))
-    return float(middle - half), float(middle + half)
+    return max(0.0, float(middle - half)), min(1.0, float(middle + half))  # rounding goes a little beyond
 
 
 def cells_of(scores: Floats) -> Floats:

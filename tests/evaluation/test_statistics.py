@@ -53,6 +53,9 @@ def test_wilson_interval_agrees_with_newcombe() -> None:
     # Newcombe (1998), table I: 81 of 263 is 0.2553 to 0.3662, 0 of 20 is 0 to 0.1611.
     assert statistics.wilson_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=5e-5)
     assert statistics.wilson_interval(0, 20) == pytest.approx((0.0, 0.1611), abs=5e-5)
+    for total in range(1, 60):
+        assert f"{statistics.wilson_interval(0, total)[0]:.0f}" == "0", "and not -0"
+        assert statistics.wilson_interval(total, total)[1] <= 1.0
 
 
 def test_interquartile_mean_drops_the_outer_quarters() -> None:

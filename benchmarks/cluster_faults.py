@@ -6,7 +6,7 @@
 its own, joined by a switch without up-link, and starts Ray on them. A run begins whose replay and learner must be on
 workers; then a role is killed, a raylet is killed, and a worker is cut off and joined again: with Ray's default health
 check and with a tuned one. At last all processes of the head are killed, the launcher with them; it is switched on
-again and the run resumed. Needs root, iproute2 and util-linux. Takes about 7 minutes, and kills only what it started.
+again and the run resumed. Needs root, iproute2 and util-linux. Takes about 6 minutes, and kills only what it started.
 
 Recovery is the time from the fault until the replaced role reports from its new process and the learner's step has
 grown since: somebody who watches `apex-bat status` sees no earlier sign. It includes up to a second each of the reports

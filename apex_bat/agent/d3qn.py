@@ -18,14 +18,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from apex_bat.agent.inference import initial_parameters
+from apex_bat.agent.inference import (
+    AVERAGE,
+    ONLINE,
+    TARGET,
+    initial_parameters,
+    parameters_under,
+    policy_parameters,
+)
 from apex_bat.agent.losses import double_q_target, td_errors, weighted_loss
 from apex_bat.agent.mirror import mirror_batch
 from apex_bat.agent.network import DuelingNetwork, Values, load_parameters, parameters_of
 from apex_bat.config import Config, settings
 from apex_bat.experience import Batch
 
-ONLINE, TARGET, AVERAGE = "online/", "target/", "average/"  # before the names of parameters
+AVERAGED_SHARE = 0.1  # of the updates so far, at most: what was learnt first does not burden the average for long
 
 
 class Update(NamedTuple):
@@ -39,9 +46,6 @@ class Update(NamedTuple):
     """Global norm of the gradient before clipping."""
     q_mean: float
     """Mean of Q(s, a) over the batch."""
-
-
-AVERAGED_SHARE = 0.1  # of the updates so far, at most: what was learnt first does not burden the average for long
 
 
 class D3QN:
@@ -119,8 +123,8 @@ class D3QN:
             ValueError: the arrays are of another network or another optimiser.
         """
         for prefix, network in self._networks().items():
-            source = prefix if prefix != AVERAGE or any(name.startswith(AVERAGE) for name in arrays) else ONLINE
-            load_parameters(network, {k.removeprefix(source): v for k, v in arrays.items() if k.startswith(source)})
+            given = policy_parameters(arrays) if prefix == AVERAGE else parameters_under(prefix, arrays)
+            load_parameters(network, given)
         state: dict[int, dict[str, torch.Tensor]] = {}
         for name, array in arrays.items():
             if name.startswith("optimiser/"):

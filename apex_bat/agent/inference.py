@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -18,6 +18,7 @@ from apex_bat.experience import ACTION_MEMORY, NUM_ACTIONS, NUM_BINS, NUM_EARS, 
 
 Array = NDArray[np.float32]
 FILTER_BINS = 3
+ONLINE, TARGET, AVERAGE = "online/", "target/", "average/"  # before the names of parameters in a learner's arrays
 NETWORK_STREAM = 4  # beside the run's seed, for a random stream that is no role's
 
 
@@ -145,6 +146,16 @@ def initial_parameters(network: settings.Network, memory_steps: int, seed: int) 
             bound = 1.0 / math.sqrt(math.prod(shape[1:]))
         parameters[name] = generator.uniform(-bound, bound, shape).astype(np.float32)
     return parameters
+
+
+def parameters_under(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
+    """Returns the parameters of one network of a learner's arrays by name, without the prefix."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+
+def policy_parameters(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
+    """Returns the parameters to fly with: the averaged ones, or the online network's without an average."""
+    return parameters_under(AVERAGE, arrays) or parameters_under(ONLINE, arrays)
 
 
 def part_norms(parameters: Mapping[str, Array]) -> dict[str, float]:

@@ -88,8 +88,7 @@ class Actor:
             for _ in range(config.bats_per_actor)
         ]
         self._policy = Policy(config.network, config.state_steps)
-        # One that joins late, or is started by hand, may have been told nothing of what the run has done.
-        self._begins_the_run = assignment.begins_the_run and not checkpoint.find(assignment.run / "checkpoints")
+        self._begins_the_run = _begins_the_run(assignment)
         self._learner_step = -1
         self._parameters: dict[str, NDArray[np.float32]] = {}
         self._phases = Phases("simulation", "policy", "gathering", clock=assignment.clock)
@@ -275,6 +274,15 @@ class Actor:
         if self._reporter.is_due:
             self.report(reason)
         return False
+
+
+def _begins_the_run(assignment: Assignment) -> bool:
+    """Whether nothing was learnt yet when this actor was first started.
+
+    One that joins late, or is started by hand, may have been told nothing of what the run has done; checkpoints tell.
+    """
+    is_first = assignment.incarnation == 0 and assignment.flown_steps == 0
+    return is_first and not checkpoint.find(assignment.run / "checkpoints")
 
 
 def _states(observation: Observation) -> States:

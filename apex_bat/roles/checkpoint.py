@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_bat.agent.inference import policy_parameters
 from apex_bat.config import Config
 from apex_bat.storage import StorageError, read_arrays, write_arrays
 
@@ -43,9 +44,8 @@ class Checkpoint(NamedTuple):
     """`online/...`, `target/...`, `optimiser/...`, and `average/...` where the learner averages."""
 
     def policy_parameters(self) -> dict[str, NDArray[np.float32]]:
-        """Returns by name the parameters to fly with: the averaged ones, or the online network's without them."""
-        prefix = "average/" if any(name.startswith("average/") for name in self.arrays) else "online/"
-        return {k.removeprefix(prefix): v for k, v in self.arrays.items() if k.startswith(prefix)}
+        """Returns the parameters to fly with by name, see `inference.policy_parameters`."""
+        return policy_parameters(self.arrays)
 
 
 def fingerprint(config: Config) -> dict[str, Any]:

@@ -113,11 +113,6 @@ class Assignment(NamedTuple):
         return load_keys(Path(folder)) if folder else None
 
     @property
-    def begins_the_run(self) -> bool:
-        """Whether, by what this role was told, nothing of the run was flown before it was first started."""
-        return self.incarnation == 0 and self.flown_steps == 0
-
-    @property
     def host(self) -> str:
         """Name of this machine."""
         return socket.gethostname()

@@ -134,6 +134,13 @@ def serves(run: Path) -> bool:
     return (run / "sockets" / "replay").exists()
 
 
+def ends_with_a_snapshot(process: RoleProcess, run: Path) -> None:
+    eventually(lambda: serves(run), 30.0, "it serves")
+    process.stop()
+    assert ended(process) == 0
+    assert (run / "replay" / "replay.snapshot").exists()
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_role_that_somebody_else_ends_saves_and_says_so(run: Path, number: signal.Signals, code: int) -> None:
     process = RoleProcess(Recipe(Role("replay", 0), run, 1), 0)
@@ -149,10 +156,7 @@ def test_a_role_that_somebody_else_ends_saves_and_says_so(run: Path, number: sig
 def test_a_role_that_its_launcher_lets_go_of_ends_with_a_last_snapshot(run: Path) -> None:
     process = RoleProcess(Recipe(Role("replay", 0), run, 1), 0)
     try:
-        eventually(lambda: serves(run), 30.0, "it serves")
-        process.stop()
-        assert ended(process) == 0
-        assert (run / "replay" / "replay.snapshot").exists()
+        ends_with_a_snapshot(process, run)
     finally:
         process.kill()
 
@@ -167,10 +171,7 @@ def test_a_process_in_reserve_begins_the_life_that_it_is_told(run: Path) -> None
         process = RoleProcess(recipe, 3, reserve=reserve)
         assert process.pid == waiting.pid
         try:
-            eventually(lambda: serves(run), 30.0, "it serves")
-            process.stop()
-            assert ended(process) == 0
-            assert (run / "replay" / "replay.snapshot").exists()
+            ends_with_a_snapshot(process, run)
         finally:
             process.kill()
     finally:

@@ -155,9 +155,8 @@ class Fleet:
         placed = kept.placed
         if kept.is_lost or (kept.hearing.heard_s is None and kept.site is None):
             return
-        is_ready = kept.site is not None and not kept.is_useless and bool(placed.waiting)
-        is_ready = is_ready and not (placed.is_lost or placed.is_over)
-        if is_ready and self._begin(kept, placed):
+        has_place = kept.site is not None and not kept.is_useless
+        if has_place and placed.can_begin and self._begin(kept, placed):
             kept.look_due_s = now_s + LOOK_S
         elif now_s >= kept.look_due_s and all(method != "look" for method, _ in kept.under_way.values()):
             kept.look_due_s = now_s + LOOK_S

@@ -100,6 +100,11 @@ class Placed:
         return bool(self._lost)
 
     @property
+    def can_begin(self) -> bool:
+        """Whether it waits for nothing but a place, and for those of replay and learner."""
+        return bool(self.waiting) and not (self.is_lost or self.is_over)
+
+    @property
     def is_over(self) -> bool:
         """Whether it has ended or is given up."""
         return self.poll() is not None

@@ -23,7 +23,7 @@ CONFIG = Path(__file__).parents[1] / "configs" / "memory.toml"
 BUDGET = 180_000
 """Environment steps, as those of a training of `apex-bat reproduce`."""
 SETTINGS = (
-    "cluster.role_cpus=0.5", "cluster.replay_resource=server", "cluster.learner_resource=server",
+    "actors=2", "cluster.role_cpus=0.5", "cluster.replay_resource=server", "cluster.learner_resource=server",
     "cluster.actor_resource=wing", "train.max_minutes=60", "evaluation.arenas=[]",
 )  # fmt: skip
 WORKER, HEAD = '{"server":1,"wing":1}', '{"head":1}'

@@ -16,6 +16,7 @@ from apex_bat.cli.concluding import conclude
 from apex_bat.cli.following import follow, locked_run
 from apex_bat.cli.options import ConfigFile, Overrides
 from apex_bat.config import Config, load
+from apex_bat.config.loading import places_anywhere, places_here
 
 if TYPE_CHECKING:  # `--help` needs none of it
     from apex_bat.launching.course import Ended
@@ -104,12 +105,12 @@ def _create(
     from apex_bat.evaluation import runs
 
     if cluster is None:
-        config = load(config_file, overrides)
+        config = load(config_file, overrides, places_anywhere if serial else places_here)
     else:
         from apex_bat.launching.cluster import ray_cluster
 
         with ray_cluster.connected(cluster):  # before a folder is made that nothing would run in
-            config = load(config_file, overrides, ray_cluster.num_actor_places)
+            config = load(config_file, overrides, ray_cluster.num_actor_places, can_grow=True)
     check(config, serial=serial, on_cluster=cluster is not None)
     folder = run or Path("runs") / f"{config_file.stem if config_file else 'default'}-{datetime.now():%Y%m%d-%H%M%S}"
     runs.create(folder, config, mode="serial" if serial else "asynchronous")

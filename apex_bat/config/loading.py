@@ -33,8 +33,17 @@ def places_here(_config: Config) -> int:
     return max(1, cores - OTHER_CORES)
 
 
+def places_anywhere(_config: Config) -> int:
+    """Returns how many actors `actors = "auto"` means where results must not depend on the machine: the default."""
+    return Config().actors
+
+
 def load(
-    path: Path | None = None, overrides: Sequence[str] = (), num_places: Callable[[Config], int] = places_here
+    path: Path | None = None,
+    overrides: Sequence[str] = (),
+    num_places: Callable[[Config], int] = places_here,
+    *,
+    can_grow: bool = False,
 ) -> Config:
     """Returns the settings of a TOML file, changed by overrides such as `replay.capacity=50000`.
 
@@ -42,8 +51,8 @@ def load(
         path: the file; None: the defaults.
         overrides: `section.key=value` with the value in TOML's notation; a bare word is taken as a string, and `none`
             means None where that is allowed.
-        num_places: says how many actors `actors = "auto"` means for the other settings; it stands in the result, and
-            `cluster.grow` is then true.
+        num_places: says how many actors `actors = "auto"` means for the other settings; it stands in the result.
+        can_grow: whether there may be more of them later: `cluster.grow` is then true in the result.
 
     Raises:
         ConfigError: names the setting, what was given and what is allowed.
@@ -51,17 +60,18 @@ def load(
     table = _read(path) if path is not None else {}
     for override in overrides:
         _apply(table, override)
-    origin = f"{path}: " if path is not None else ""
     try:
         if table.get("actors") == AUTO:
             table["actors"] = MOST_ACTORS
-            table["cluster"] = {"grow": True, **table.get("cluster", {})}
+            if can_grow:
+                table["cluster"] = {"grow": True, **table.get("cluster", {})}
             table["actors"] = min(MOST_ACTORS, num_places(msgspec.convert(table, Config)))
         return msgspec.convert(table, Config)
     except msgspec.ValidationError as error:
-        raise ConfigError(origin + _explain(str(error))) from None
+        text = _explain(str(error))
+        raise ConfigError(_origin(text.partition(":")[0], path, overrides) + text) from None
     except RecursionError:
-        raise ConfigError(f"{origin}tables within tables without end") from None
+        raise ConfigError(f"{path or '--set'}: tables within tables without end") from None
 
 
 def save(config: Config, path: Path) -> None:
@@ -133,6 +143,15 @@ def _value(text: str) -> Any:
         return parse_toml(f"value = {text}".encode())["value"]
     except (ValueError, RecursionError):
         return text
+
+
+def _origin(name: str, path: Path | None, overrides: Sequence[str]) -> str:
+    """Returns where the value of a setting, or of one in a section, came from: the last override of it, or the file."""
+    for override in reversed(overrides):
+        key = override.partition("=")[0].strip()
+        if name == key or name.startswith((f"{key}.", f"{key}[")) or key.startswith(f"{name}."):
+            return f"--set {override}: "
+    return f"{path}: " if path is not None else ""
 
 
 def _explain(message: str) -> str:

@@ -136,7 +136,7 @@ class Cluster(Section, frozen=True):
     actor_resource: str = ""
     """The same for each actor."""
     grow: bool = False
-    """Whether further actors are started when the cluster has room for more. `actors = "auto"` sets it."""
+    """Whether further actors are started when the cluster has room for more. `actors = "auto"` sets it there."""
     wait_s: Positive = 120.0
     """How long to wait at the start for a place for replay, learner, evaluator and one actor; then the run fails."""
     lease_s: Annotated[float, Meta(ge=2.0)] = 20.0

@@ -51,7 +51,8 @@ class Config(Section, frozen=True):
     condition: Condition = "memory"
     """What the bat may use: three echoes, the newest only, or only the onsets of them (thesis)."""
     actors: Annotated[int, Meta(ge=1, le=MOST_ACTORS)] = 2
-    """Actor processes. `auto`: as many as this machine has cores, less two, or as the cluster has room for."""
+    """Actor processes. `auto`: as many as this machine has cores, less two, at least 1, or as the cluster has room for;
+    in serial mode the default."""
     bats_per_actor: Annotated[int, Meta(ge=1, le=1024)] = 16
     """Bats that each actor flies in one world, in step."""
     device: Literal["auto", "cpu", "cuda"] = "auto"

@@ -11,7 +11,8 @@ import pytest
 
 from apex_bat.config import load
 from benchmarks import tune
-from benchmarks.tune import Seen, propose, search, see, train, value_of
+from benchmarks.tune import Seen, again, changed, propose, search, see, train, value_of
+from benchmarks.tune_page import FILE, page
 
 
 class FakeTrial:
@@ -63,6 +64,64 @@ def test_every_trial_is_told_with_its_time_and_has_a_seed_of_its_own() -> None:
     assert [trial.notes for trial, _ in study.told] == [{"most_completed": n} for n in (15, 7, 0)]
     assert seeds == [0, 1, 2]
     assert lines[1].startswith("trial 1: 540 s, at most 7 of 15 (actors 1, ")
+
+
+def test_the_search_begins_with_what_ships_within_the_bounds_of_the_search() -> None:
+    shipped = tune.shipped()
+    config = load(Path(tune.CONFIG), [f"{name}={number}" for name, number in shipped.items()])
+    assert config == load(Path(tune.CONFIG))
+    asked = dict[str, Any]()
+
+    class Bounds(FakeTrial):
+        def suggest_int(self, name: str, low: int, high: int) -> int:
+            asked[name] = low <= shipped[name] <= high
+            return low
+
+        def suggest_float(self, name: str, low: float, high: float, *, log: bool) -> float:
+            asked[name] = low <= shipped[name] <= high and log
+            return low
+
+        def suggest_categorical(self, name: str, choices: tuple[int, ...]) -> int:
+            asked[name] = shipped[name] in choices
+            return choices[0]
+
+    propose(Bounds(0))
+    assert asked == dict.fromkeys(shipped, True)
+
+
+def test_settings_are_trained_anew_by_turns() -> None:
+    order: list[tuple[float, int]] = []
+
+    def measure(settings: Any, seed: int) -> Seen:
+        order.append((settings["actors"], seed))
+        return Seen(10.0 * settings["actors"] + seed, 15)
+
+    assert again([{"actors": 1}, {"actors": 2}], [1, 2], 60.0, measure) == [[11.0, 12.0], [21.0, 22.0]]
+    assert order == [(1, 1), (2, 1), (1, 2), (2, 2)]
+
+
+def test_one_setting_is_changed_alone() -> None:
+    assert changed({"actors": 2, "replay.samples_per_insert": 8.0}, "actors=1") == {
+        "actors": 1, "replay.samples_per_insert": 8.0,
+    }  # fmt: skip
+
+
+def test_the_page_shows_what_ships_beside_what_was_found() -> None:
+    shipped, found = {"actors": 2, "learner.learning_rate": 2.5e-4}, {"actors": 1, "learner.learning_rate": 1e-3}
+    text = page({
+        "machine": {"cores": 2}, "limit_s": 240.0, "period_s": 20.0, "new_period_s": 10.0, "shipped": shipped,
+        "trials": [
+            {"settings": shipped, "value_s": 66.4, "most": 14}, {"settings": found, "value_s": 50.2, "most": 15},
+        ],
+        "anew": [{"settings": shipped, "values_s": [70.0, 60.0, 90.0]}, {"settings": found, "values_s": []}],
+    })  # fmt: skip
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert rows[2] == "| **70** | 70, 60, 90 | * | 2 | 0.00025 |"
+    assert rows[-2:] == ["| 50 | 15 |  | 1 | 0.001 |", "| 66 | 14 | * | 2 | 0.00025 |"]
+
+
+def test_the_page_is_that_of_the_file() -> None:
+    assert FILE.with_suffix(".md").read_text() == page(json.loads(FILE.read_text()))
 
 
 def test_what_never_got_there_is_worse_than_what_did_and_better_the_more_it_completed() -> None:

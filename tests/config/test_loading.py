@@ -1,14 +1,16 @@
 """Settings from files and the command line: what is refused, and in which words."""
 
+import os
 from pathlib import Path
 
 import msgspec
 import pytest
 
 from apex_bat.config import Config, ConfigError, load, save
-from apex_bat.config.loading import differences
+from apex_bat.config.loading import differences, places_anywhere
 
-CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
+FOLDER = Path(__file__).parents[2] / "configs"
+CONFIGS = sorted(FOLDER.glob("*.toml"))
 
 
 def test_defaults_load_without_a_file() -> None:
@@ -82,6 +84,36 @@ def test_files_that_cannot_be_used_are_named(text: bytes, says: str, tmp_path: P
     with pytest.raises(ConfigError, match=says) as caught:
         load(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "begins"),
+    [
+        (["replay.capacity=few"], "--set replay.capacity=few: replay.capacity: "),
+        (["actors=1", "actors=-1", "bats_per_actor=4"], "--set actors=-1: actors: "),
+        (["reply.capacity=5"], "--set reply.capacity=5: reply: no such setting"),
+        (["network.channels=[4,'x']"], "--set network.channels=[4,'x']: network.channels["),
+        (["actors=2"], "{path}: seed: "),
+    ],
+)
+def test_a_wrong_value_is_told_with_where_it_came_from(overrides: list[str], begins: str, tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text("seed = 'x'" if "{path}" in begins else "seed = 1")
+    with pytest.raises(ConfigError) as caught:
+        load(path, overrides)
+    assert str(caught.value).startswith(begins.format(path=path))
+
+
+@pytest.mark.parametrize(("cores", "actors"), [(1, 1), (2, 1), (4, 2), (64, 62)])
+def test_the_bats_configurations_use_the_cores_that_there_are(
+    cores: int, actors: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(cores), raising=False)
+    for name in ("memory", "no_memory", "onset"):
+        config = load(FOLDER / f"{name}.toml")
+        assert (config.actors, config.cluster.grow) == (actors, False)
+        assert load(FOLDER / f"{name}.toml", (), places_anywhere).actors == 2
+        assert load(FOLDER / f"{name}.toml", ["actors=3"]).actors == 3
 
 
 def test_a_missing_file_is_named() -> None:

@@ -87,10 +87,11 @@ def test_actors_auto_is_a_number_in_the_settings_of_the_run(tmp_path: Path) -> N
         given.append(config)
         return 10
 
-    config = load(None, ["actors=auto", "cluster.role_cpus=2"], ten)
+    config = load(None, ["actors=auto", "cluster.role_cpus=2"], ten, can_grow=True)
     assert (config.actors, config.cluster.grow) == (10, True)
     assert given[0].cluster.role_cpus == 2.0, "the other settings are known when actors are counted"
     file = tmp_path / "c.toml"
     file.write_text('actors = "auto"\n')
     assert load(file, (), lambda _: 3).actors == 3
+    assert not load(file, (), lambda _: 3).cluster.grow
     assert not load(None, ["actors=4"]).cluster.grow

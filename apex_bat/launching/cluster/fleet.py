@@ -17,7 +17,7 @@ import msgspec
 from apex_bat.config import Config
 from apex_bat.launching.cluster.directory import Directory, new_generation
 from apex_bat.launching.cluster.keeper import Look, Site, versions_here
-from apex_bat.launching.cluster.kept import MOST_FAILED_STARTS, Kept, LostError, Placer, Ticket
+from apex_bat.launching.cluster.kept import MOST_FAILED_STARTS, Kept, LostError, Placer, Ticket, with_next
 from apex_bat.launching.cluster.placed import Placed
 from apex_bat.launching.cluster.placement import ClusterError
 from apex_bat.launching.cluster.places import Places
@@ -65,6 +65,7 @@ class Fleet:
         self._places.close()
         for kept in self._kept.values():
             kept.dismiss()
+            kept.drop_next()
 
     def start(self, role: Role, incarnation: int, flown_steps: int) -> Placed:
         """Starts a role where it was before, if its keeper lives, or in a new place; returns at once.
@@ -78,7 +79,7 @@ class Fleet:
         with self._lock:
             kept = self._kept.get(role.name)
             if kept is None or kept.is_lost or kept.hearing.is_over(time.monotonic()):
-                kept = self._kept[role.name] = self._new_kept(role, kept)
+                kept = self._kept[role.name] = self._next_kept(role, kept)
             self._num_lives += 1
             kept.placed = Placed(
                 role, self._num_lives, self._placer.asks(role), self._config, kept.hearing, kept.orderer()
@@ -94,14 +95,17 @@ class Fleet:
         with self._lock:
             return any(kept.has_no_place for kept in self._kept.values())
 
-    def _new_kept(self, role: Role, former: Kept | None) -> Kept:
-        """Returns a keeper to be made, not before all that was started on the former one has ended."""
-        not_before_s = 0.0
-        if former is not None:
-            former.dismiss()
-            if role.kind != "actor" and former.hearing.lost_s is not None:
-                not_before_s = former.hearing.gone_s()
-        return Kept(role, self._config.cluster.lease_s, time.monotonic(), not_before_s)
+    def _next_kept(self, role: Role, former: Kept | None) -> Kept:
+        """Returns the keeper found in advance, or one to be made when all that ran on the former one has ended."""
+        lease_s, now_s = self._config.cluster.lease_s, time.monotonic()
+        if former is None:
+            return Kept(role, lease_s, now_s)
+        former.dismiss()
+        if former.next is not None and not former.next.is_lost:
+            former.next.is_in_advance = False
+            return former.next
+        is_awaited = role.kind != "actor" and former.hearing.lost_s is not None
+        return Kept(role, lease_s, now_s, former.hearing.gone_s() if is_awaited else 0.0, former.doubtful_node)
 
     def _clean_after(self, role: Role) -> None:
         """Removes what the former life of a role was writing: a keeper that is late would remove what the next writes.
@@ -142,9 +146,10 @@ class Fleet:
     def _look_after_all(self) -> None:
         while not self._is_closed.is_set():
             with self._lock:
-                for kept in self._kept.values():
+                everyone = with_next(self._kept.values())
+                for kept in everyone:
                     self._advance(kept)
-                owners = {ticket: kept for kept in self._kept.values() for ticket in kept.under_way}
+                owners = {ticket: kept for kept in everyone for ticket in kept.under_way}
             for ticket, answer in self._placer.answers(list(owners), _WAIT_S):
                 with self._lock:
                     self._take(owners[ticket], ticket, answer)
@@ -155,7 +160,7 @@ class Fleet:
         placed = kept.placed
         if kept.is_lost or (kept.hearing.heard_s is None and kept.site is None):
             return
-        has_place = kept.site is not None and not kept.is_useless
+        has_place = kept.site is not None and not (kept.is_useless or kept.is_in_advance)
         if has_place and placed.can_begin and self._begin(kept, placed):
             kept.look_due_s = now_s + LOOK_S
         elif now_s >= kept.look_due_s and all(method != "look" for method, _ in kept.under_way.values()):
@@ -182,7 +187,7 @@ class Fleet:
     def _news_for(self, kept: Kept) -> bytes | None:
         """Returns orders for a role that does not know the newest addresses; None if there is no news."""
         placed = kept.placed
-        if placed.waiting or kept.told_version == self._directory.version:
+        if placed.waiting or kept.is_in_advance or kept.told_version == self._directory.version:
             return None
         addresses = self._directory.addresses_for(placed.role, self._collector.generations[placed.role.name])
         if addresses is None:
@@ -197,49 +202,37 @@ class Fleet:
         method, life = asked
         placed = kept.placed
         if isinstance(answer, LostError):
-            if not kept.is_lost:
+            if not kept.is_lost:  # else it was we who ended it
+                kept.is_known_lost = True
                 _log.warning("%s: its keeper is lost: %s", placed.role.name, answer)
-                kept.dismiss()  # it may only be out of reach
-            kept.is_lost = True
-            placed.take_loss(str(answer))
-            self._replace(kept)
+                kept.lose(str(answer))
         elif isinstance(answer, Look):
             kept.hearing.take(time.monotonic(), answer.number)
-            placed.take_look(answer)
+            if not kept.is_in_advance:
+                placed.take_look(answer)
         elif method == "look":  # one that did not come through: the news that it carried goes again
             kept.told_version = -1
         elif life != placed.life:
             return
-        elif isinstance(answer, Exception):
-            self._take_error(kept, placed, method, answer)
-        elif isinstance(answer, Site) and placed.is_lost:  # a place in advance: the next life asks again
+        elif kept.is_in_advance and isinstance(answer, Exception):
+            kept.lose(str(answer))
+        elif kept.is_in_advance and isinstance(answer, Site):  # the life that begins there asks again
             kept.site = answer
             kept.hearing.take(time.monotonic())
+        elif isinstance(answer, Exception):
+            self._take_error(kept, placed, method, answer)
         elif isinstance(answer, Site):
             self._take_site(kept, placed, answer)
         elif method == "start" and isinstance(answer, int):
             kept.failed_starts = 0
             placed.take_start(answer)
 
-    def _replace(self, kept: Kept) -> None:
-        """Asks for the next place at once, while what was started on a lost keeper may still be ending.
-
-        To find a place and start a keeper there takes seconds. Nothing is started in it before the next life begins,
-        which the supervisor asks for when the former one is over.
-        """
-        placed = kept.placed
-        if kept.role.kind == "actor" or placed.is_over or self._kept.get(kept.role.name) is not kept:
-            return
-        fresh = Kept(kept.role, self._config.cluster.lease_s, time.monotonic())
-        fresh.placed = placed
-        self._kept[kept.role.name] = fresh
-
     def _take_error(self, kept: Kept, placed: Placed, method: str, error: Exception) -> None:
         placed.take_error(error)
         kept.failed_starts += method in ("site", "start")
         if kept.failed_starts >= MOST_FAILED_STARTS:
             _log.warning("%s: could not be started %d times; leaves its place", placed.role.name, kept.failed_starts)
-            kept.leave_place(str(error))
+            kept.lose(str(error))
 
     def _take_site(self, kept: Kept, placed: Placed, site: Site) -> None:
         kept.site = site

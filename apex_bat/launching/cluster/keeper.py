@@ -45,6 +45,8 @@ class Site(NamedTuple):
     """A TCP port that is free there now; 0 for a role that listens nowhere."""
     problem: str
     """Why no role can be started there; empty if one can."""
+    node: str = ""
+    """The host, as the cluster's own scheduler calls it; empty if there is none."""
 
 
 class Look(NamedTuple):
@@ -73,6 +75,7 @@ class Keeper:
         lease_s: float,
         address: str,
         base_port: int = 0,
+        node: str = "",
         clock: Callable[[], float] = clock_s,
     ) -> None:
         """Begins its lease; starts nothing yet.
@@ -84,9 +87,11 @@ class Keeper:
             lease_s: see `lease`.
             address: IP address of this host.
             base_port: first of the ports that servers may take; 0: any.
+            node: see `Site`.
             clock: seconds, never backwards.
         """
         self._run, self._mark, self._address, self._base_port = Path(run), mark, address, base_port
+        self._node = node
         self._folder = Path(folder) if Path(folder).is_dir() else None
         self._process: RoleProcess | None = None
         self._reserve: Reserve | None = None
@@ -111,7 +116,7 @@ class Keeper:
         problem = problem or self._foreign_folder()
         listens = role.kind in ("replay", "learner")
         port = free_port(self._address, self._base_port, first_port(role)) if listens and not problem else 0
-        return Site(socket.gethostname(), self._address, port, problem)
+        return Site(socket.gethostname(), self._address, port, problem, self._node)
 
     def start(
         self, life: int, role: Role, incarnation: int, num_threads: int, flown_steps: int, orders: bytes,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Protocol
+from collections.abc import Callable, Collection, Iterable, Iterator
+from typing import Literal, Protocol
 
 from apex_bat.launching.cluster.keeper import Site
 from apex_bat.launching.cluster.lease import Hearing
@@ -13,6 +13,9 @@ from apex_bat.roles.plan import Role
 MOST_FAILED_STARTS = 3
 """How often in a row a keeper may fail to start its role; then it is dismissed, and another place is looked for."""
 
+Fate = Literal["unknown", "refusing", "removed"]
+"""Of a node: nothing is known; it refuses what Ray's own daemon would take, so that no keeper lives there any more; the
+cluster itself has counted it out."""
 Ticket = object
 """Stands for the answer to a call that is under way."""
 
@@ -37,8 +40,20 @@ class Placer(Protocol):
     def asks(self, role: Role) -> str:
         """Returns what a role asks of the cluster, as text."""
 
-    def place(self, role: Role) -> Remote:
-        """Returns a keeper for a role; it may have no place for long."""
+    def place(self, role: Role, away_from: str = "", *, is_reserved: bool = True) -> Remote:
+        """Returns a keeper for a role; it may have no place for long.
+
+        Args:
+            role: which.
+            away_from: node that is not to be its place; empty: any will do.
+            is_reserved: whether a place that is reserved for the role is to be taken.
+        """
+
+    def reserves(self, role: Role) -> bool:
+        """Whether a place is reserved for a role."""
+
+    def fates(self, nodes: Collection[str]) -> dict[str, Fate]:
+        """Returns what is known of nodes whose keepers are silent; takes half a second at most, head permitting."""
 
     def is_short(self) -> bool:
         """Whether the cluster has no place at present for the roles that hold theirs: all but the further actors."""
@@ -53,7 +68,9 @@ class Placer(Protocol):
 class Kept:
     """A keeper, and the life of its role that it keeps now."""
 
-    def __init__(self, role: Role, lease_s: float, now_s: float, not_before_s: float = 0.0) -> None:
+    def __init__(
+        self, role: Role, lease_s: float, now_s: float, not_before_s: float = 0.0, away_from: str = ""
+    ) -> None:
         """Asks for no place yet.
 
         Args:
@@ -61,8 +78,9 @@ class Kept:
             lease_s: see `lease`.
             now_s: the time.
             not_before_s: when a place may be asked for: what ran on the keeper before has ended then.
+            away_from: node where the role was before, which may not be well.
         """
-        self.role, self.not_before_s = role, not_before_s
+        self.role, self.not_before_s, self.away_from = role, not_before_s, away_from
         self.remote: Remote | None = None  # None: no place is asked for yet
         self.asked_s = now_s
         self.hearing = Hearing(lease_s)
@@ -74,14 +92,32 @@ class Kept:
         self.under_way: dict[Ticket, tuple[str, int]] = {}  # method and life of each call
         self.look_due_s = 0.0
         self.failed_starts = 0
-        self.is_lost = False
+        self.is_reserved = True
+        """Whether the place that is reserved for the role is asked for."""
+        self.num_refusals = 0
+        """How often in a row its node has said that it is gone."""
+        self.is_lost = self.is_known_lost = False
+        """Whether it is gone, and whether the cluster said so, which then offers no place on a node that is gone."""
+        self.next: Kept | None = None
+        """Where the role goes if this one is lost: found in advance while nothing is heard of it."""
+        self.is_in_advance = False
+        """Whether it is the `next` of another, and keeps nothing yet."""
         self.is_useless = False
         """Whether no role can be started there, although its keeper lives."""
+
+    @property
+    def doubtful_node(self) -> str:
+        """Where the role should not go next: where it was, as long as the cluster itself knows nothing of a loss."""
+        return "" if self.site is None or self.is_known_lost else self.site.node
 
     @property
     def has_no_place(self) -> bool:
         """Whether it has no place yet, and waits for one."""
         return self.site is None and not self.is_lost and not self.placed.is_over
+
+    def waits_s(self, now_s: float) -> float:
+        """Returns for how long its place has been asked for in vain; 0 if none is asked for, or there is one."""
+        return now_s - self.asked_s if self.remote is not None and self.site is None and not self.is_lost else 0.0
 
     def ask(self, method: str, *given: object) -> None:
         """Calls a method of the keeper, if there is one; the answer comes to the life of now."""
@@ -102,8 +138,32 @@ class Kept:
         if self.remote is not None:
             self.remote.dismiss()
 
-    def leave_place(self, reason: str) -> None:
-        """Gives the place back: its keeper ends, and the role needs another one."""
+    def lose(self, reason: str) -> None:
+        """Notes that the keeper is gone, or is to go: it may only be out of reach. The role needs another one."""
         self.dismiss()
         self.is_lost = True
-        self.placed.take_loss(reason)
+        if not self.is_in_advance:
+            self.placed.take_loss(reason)
+
+    def begin_next(self, now_s: float) -> None:
+        """Asks for the next place, where nothing is started before this one's life is over: to find it takes long."""
+        self.next = Kept(self.role, self.hearing.lease_s, now_s, away_from=self.doubtful_node)
+        self.next.placed, self.next.is_in_advance = self.placed, True
+
+    def drop_next(self) -> None:
+        """Gives the next place back."""
+        if self.next is not None:
+            self.next.dismiss()
+            self.next = None
+
+    def ask_anew(self, now_s: float) -> None:
+        """Takes back what was asked for in vain, and asks otherwise: for any node, or not for the reserved place."""
+        self.dismiss()
+        self.is_reserved = bool(self.away_from) or not self.is_reserved
+        self.remote, self.away_from, self.asked_s = None, "", now_s
+        self.under_way.clear()
+
+
+def with_next(several: Iterable[Kept]) -> list[Kept]:
+    """Returns keepers, and behind each the one that was asked for in advance."""
+    return [one for kept in several for one in (kept, kept.next) if one is not None]

@@ -58,7 +58,7 @@ class Hearing:
     """The launcher's end: what it knows of one keeper."""
 
     def __init__(self, lease_s: float) -> None:
-        self._lease_s = lease_s
+        self.lease_s = lease_s
         self.seen = 0
         """Number of the newest answer."""
         self.heard_s: float | None = None
@@ -73,6 +73,10 @@ class Hearing:
         self.heard_s = now_s
         if number is not None:
             self.seen = number
+
+    def silent_s(self, now_s: float) -> float:
+        """Returns for how long the keeper has not been heard; 0 before its first answer."""
+        return 0.0 if self.heard_s is None else now_s - self.heard_s
 
     def take_loss(self, now_s: float) -> None:
         """Notes that the keeper is gone."""
@@ -94,4 +98,4 @@ class Hearing:
 
     def is_over(self, now_s: float) -> bool:
         """Whether the keeper's lease has ended for certain."""
-        return self.heard_s is not None and now_s >= self.heard_s + self._lease_s + MARGIN_S
+        return self.heard_s is not None and now_s >= self.heard_s + self.lease_s + MARGIN_S

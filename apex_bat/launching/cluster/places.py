@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 
 from apex_bat.launching.cluster.keeper import versions_here
-from apex_bat.launching.cluster.kept import Kept, Placer
+from apex_bat.launching.cluster.kept import Kept, Placer, with_next
 
 PATIENCE_S = 3.0
 """How long replay, learner or evaluator may be without a place until actors leave theirs."""
@@ -20,6 +20,12 @@ ROOM_PERIOD_S = 2.0
 """Between two questions whether places are short, and between two actors that leave theirs."""
 CLOSE_S = 5.0
 """How long the end waits for a question that is under way: a head that is gone does not answer it."""
+SILENT_S = 2.0
+"""After how long a silence a next place is looked for: to find one and start a keeper there takes seconds."""
+ASK_AFTER_S, ASK_PERIOD_S, MOST_REFUSALS = 1.0, 0.5, 3
+"""After how long a silence the keeper's node is asked itself, how often, and how many refusals are believed."""
+OTHERWISE_S = 15.0
+"""How long a place is asked for in one way: away from a doubtful node, or the one that is reserved, or any other."""
 _LOOK_S = 0.05
 _log = logging.getLogger(__name__)
 
@@ -46,7 +52,7 @@ class Places:
         """
         self._placer, self._kept, self._lock = placer, kept, lock
         self._tell, self._fail = tell, fail
-        self._is_short, self._room_due_s = False, 0.0
+        self._is_short, self._room_due_s, self._ask_due_s = False, 0.0, 0.0
         self._is_closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="places", daemon=True)
 
@@ -62,6 +68,8 @@ class Places:
     def _run(self) -> None:
         try:
             while not self._is_closed.wait(_LOOK_S):
+                self._ask_nodes(time.monotonic())
+                self._look_ahead(time.monotonic())
                 self._make_room(time.monotonic())
                 self._place_all(time.monotonic())
                 self._tell()
@@ -69,13 +77,55 @@ class Places:
             _log.exception("failed")
             self._fail(error)
 
+    def _ask_nodes(self, now_s: float) -> None:
+        """Asks the nodes of silent keepers, of whose loss Ray tells after 12 s at the earliest, by its defaults."""
+        if now_s < self._ask_due_s:
+            return
+        self._ask_due_s = now_s + ASK_PERIOD_S
+        with self._lock:
+            silent = [kept for kept in self._kept.values() if self._is_silent(kept, now_s, ASK_AFTER_S)]
+            waiting = [kept for kept in with_next(self._kept.values()) if self._can_ask_anew(kept, now_s)]
+        nodes = {*(kept.doubtful_node for kept in silent), *(kept.away_from for kept in waiting)} - {""}
+        fates = self._placer.fates(nodes) if nodes else {}
+        now_s = time.monotonic()
+        with self._lock:
+            for kept in silent:
+                is_refused = fates.get(kept.doubtful_node) == "refusing" and self._is_silent(kept, now_s, ASK_AFTER_S)
+                kept.num_refusals = kept.num_refusals + 1 if is_refused else 0
+                if kept.num_refusals >= MOST_REFUSALS:
+                    _log.warning("%s: its node refuses connections: Ray has ended there", kept.role.name)
+                    kept.lose("its node refuses connections")
+            for kept in waiting:
+                patience_s = PATIENCE_S if fates.get(kept.away_from) == "removed" else OTHERWISE_S
+                if kept.waits_s(now_s) > patience_s:
+                    kept.ask_anew(now_s)
+
+    def _can_ask_anew(self, kept: Kept, now_s: float) -> bool:
+        """Whether a keeper's place is asked for in vain, and there is another way to ask."""
+        return kept.waits_s(now_s) > 0.0 and (bool(kept.away_from) or self._placer.reserves(kept.role))
+
+    def _look_ahead(self, now_s: float) -> None:
+        """Asks for a next place for what is lost or silent, and gives it back when that is heard again."""
+        with self._lock:
+            for kept in self._kept.values():
+                if not (kept.is_lost or self._is_silent(kept, now_s, SILENT_S)):
+                    kept.drop_next()
+                elif kept.role.kind == "actor" or kept.placed.is_over:  # what is there already stays for the next life
+                    continue
+                elif kept.next is None or (kept.next.is_lost and now_s - kept.next.asked_s > PATIENCE_S):
+                    kept.begin_next(now_s)
+
+    def _is_silent(self, kept: Kept, now_s: float, least_s: float) -> bool:
+        return kept.site is not None and not kept.is_lost and kept.hearing.silent_s(now_s) > least_s
+
     def _place_all(self, now_s: float) -> None:
         with self._lock:
-            wanted = [kept for kept in self._kept.values() if self._wants_place(kept) and now_s >= kept.not_before_s]
+            everyone = with_next(self._kept.values())
+            wanted = [kept for kept in everyone if self._wants_place(kept) and now_s >= kept.not_before_s]
         for kept in wanted:
-            remote = self._placer.place(kept.role)
+            remote = self._placer.place(kept.role, kept.away_from, is_reserved=kept.is_reserved)
             with self._lock:
-                is_current = self._kept.get(kept.role.name) is kept and not self._is_closed.is_set()
+                is_current = kept in with_next(self._kept.values()) and not self._is_closed.is_set()
                 if not (is_current and self._wants_place(kept)):
                     remote.dismiss()
                     continue
@@ -84,7 +134,8 @@ class Places:
 
     def _wants_place(self, kept: Kept) -> bool:
         is_held = self._is_short and kept.role.kind == "actor"
-        return kept.remote is None and not is_held and not kept.placed.is_over
+        is_over = kept.placed.is_over and not kept.is_in_advance
+        return kept.remote is None and not (is_held or is_over or kept.is_lost)
 
     def _make_room(self, now_s: float) -> None:
         """Takes places from actors while the cluster has none for a role without which nothing is learned."""
@@ -114,4 +165,4 @@ class Places:
         victim = next((kept for kept in further if kept.site is not None and not kept.is_lost), None)
         if victim is not None:
             _log.warning("%s: leaves its place to a role that has none", victim.role.name)
-            victim.leave_place("its place went to a role without which nothing is learned")
+            victim.lose("its place went to a role without which nothing is learned")

@@ -6,8 +6,9 @@ exit codes.
 
 from __future__ import annotations
 
+import asyncio
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,13 @@ from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from apex_bat.config import Config
 from apex_bat.launching.cluster.keeper import Keeper, Look, Site
-from apex_bat.launching.cluster.kept import LostError, Remote
+from apex_bat.launching.cluster.kept import Fate, LostError, Remote
 from apex_bat.launching.cluster.placement import Resources, as_text, demand_of
 from apex_bat.roles.plan import Role
 
 own_address: Callable[[], str] = ray.util.get_node_ip_address
+_nodes: Callable[[], list[dict[str, Any]]] = ray.nodes
+_CONNECT_S = 0.4
 
 
 class RayPlacer:
@@ -49,13 +52,20 @@ class RayPlacer:
         """Returns what a role asks of the cluster, as text."""
         return as_text(self._demand(role))
 
-    def place(self, role: Role) -> Remote:
-        """Asks for a place with a keeper; returns at once."""
+    def place(self, role: Role, away_from: str = "", *, is_reserved: bool = True) -> Remote:
+        """Asks for a place with a keeper; returns at once.
+
+        Where the role's own place is on the node that is to be left, one outside the group is asked for: those within
+        it move only when Ray itself has given that node up.
+        """
         demand = dict(self._demand(role))
-        strategy: Any = "SPREAD"
-        if role.name in self._bundles:
-            strategy = PlacementGroupSchedulingStrategy(self._group, self._bundles[role.name])
         options: dict[str, Any] = {"num_cpus": demand.pop("CPU"), "num_gpus": demand.pop("GPU", 0)}
+        strategy: Any = "SPREAD"
+        index = self._bundles.get(role.name) if is_reserved else None
+        if index is not None and not (away_from and self._node_of(index) in ("", away_from)):
+            strategy = PlacementGroupSchedulingStrategy(self._group, index)
+        elif away_from:
+            options["label_selector"] = {"ray.io/node-id": f"!{away_from}"}
         if memory := demand.pop("memory", 0.0):
             options["memory"] = int(memory)
         keeper = _RemoteKeeper.options(  # type: ignore[attr-defined]
@@ -63,9 +73,21 @@ class RayPlacer:
         ).remote(*self._given)
         return _RayRemote(keeper)
 
+    def reserves(self, role: Role) -> bool:
+        """Whether the group holds a place for a role."""
+        return role.name in self._bundles
+
     def is_short(self) -> bool:
         """Whether Ray looks for places anew for the group, because a node is gone that had one."""
         return str(placement_group_table(self._group).get("state")) != "CREATED"
+
+    def fates(self, nodes: Collection[str]) -> dict[str, Fate]:
+        """Returns what is known of nodes: from Ray, or from the port of its daemon there."""
+        known = {node["NodeID"]: node for node in _nodes()}
+        living = {node: known[node] for node in nodes if node in known and known[node]["Alive"]}
+        ports = [(str(node["NodeManagerAddress"]), int(node["NodeManagerPort"])) for node in living.values()]
+        refusing = dict(zip(living, asyncio.run(_refusing(ports)), strict=True))
+        return {node: ("refusing" if refusing[node] else "unknown") if node in living else "removed" for node in nodes}
 
     def answers(self, tickets: list[object], timeout_s: float) -> Iterator[tuple[object, object]]:
         """Yields ticket and answer, or the error, of those that are answered within the time."""
@@ -83,6 +105,10 @@ class RayPlacer:
             except ray.exceptions.RayError as error:
                 yield ticket, LostError(_reason(error))
 
+    def _node_of(self, index: int) -> str:
+        """Returns where a place of the group is; empty while it is nowhere."""
+        return str(placement_group_table(self._group).get("bundles_to_node_id", {}).get(index, ""))
+
     def _demand(self, role: Role) -> Resources:
         return self._demands.get(role.name, self._actor_demand)
 
@@ -92,8 +118,8 @@ class _RemoteKeeper:
     """A keeper in an actor of Ray."""
 
     def __init__(self, run: str, mark: str, folder: str, lease_s: float, base_port: int) -> None:
-        address = own_address()
-        self._keeper = Keeper(run, mark, folder, lease_s, address, base_port)
+        node = ray.get_runtime_context().get_node_id()
+        self._keeper = Keeper(run, mark, folder, lease_s, own_address(), base_port, node)
 
     def site(self, versions: tuple[str, str], role: Role) -> Site:
         return self._keeper.site(versions, role)
@@ -122,6 +148,22 @@ class _RayRemote:
 
     def dismiss(self) -> None:
         ray.kill(self._keeper, no_restart=True)
+
+
+async def _refusing(ports: list[tuple[str, int]]) -> list[bool]:
+    """Returns whether TCP ports refuse connections; False of one that takes them or is silent."""
+
+    async def refuses(host: str, port: int) -> bool:
+        try:
+            _, writer = await asyncio.wait_for(asyncio.open_connection(host, port), _CONNECT_S)
+        except ConnectionRefusedError:
+            return True
+        except (OSError, TimeoutError):
+            return False
+        writer.close()
+        return False
+
+    return list(await asyncio.gather(*(refuses(*one) for one in ports)))
 
 
 def _raised(error: ray.exceptions.RayTaskError) -> Exception:

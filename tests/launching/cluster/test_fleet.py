@@ -3,148 +3,24 @@
 from __future__ import annotations
 
 import errno
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 import pytest
 
-from apex_bat.config import load
-from apex_bat.launching.cluster import places as module
 from apex_bat.launching.cluster.fleet import Fleet
-from apex_bat.launching.cluster.keeper import Look, Site
-from apex_bat.launching.cluster.kept import MOST_FAILED_STARTS, LostError
+from apex_bat.launching.cluster.kept import MOST_FAILED_STARTS
 from apex_bat.launching.cluster.lease import Hearing
 from apex_bat.launching.cluster.placed import Placed
 from apex_bat.launching.supervisor import USELESS
-from apex_bat.roles.orders import ORPHANED_S, Orders
+from apex_bat.roles.orders import ORPHANED_S
 from apex_bat.roles.plan import Role, read_addresses
 from apex_bat.roles.process import ADDRESSES
 from apex_bat.transport.reports import ReportCollector
 from apex_bat.transport.security import new_keys
-
-REPLAY, LEARNER, ACTOR = Role("replay", 0), Role("learner", 0), Role("actor", 0)
-CONFIG = load(None, ["cluster.lease_s=2.0", "launch.grace_s=1.0"])
-
-
-class Call(NamedTuple):
-    """A call that is under way."""
-
-    host: Host
-    method: str
-    given: tuple[object, ...]
-
-    def __hash__(self) -> int:
-        return id(self)
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
-
-
-class Host:
-    """A keeper played by the test."""
-
-    def __init__(self, number: int, role: Role) -> None:
-        self.number, self.role = number, role
-        self.has_place = True
-        self.is_lost = self.is_silent = self.is_dismissed = False
-        self.problem = ""
-        self.pids_differ = True
-        self.error: Exception | None = None
-        self.failing = ""
-        """The method that is answered by `error`, while there is one."""
-        self.starts: list[Orders] = []
-        self.news: list[Orders] = []
-        self.ended = False
-        self._looks = self._life = 0
-
-    def call(self, method: str, *given: object) -> object:
-        return Call(self, method, given)
-
-    def dismiss(self) -> None:
-        self.is_dismissed = True
-
-    def answer(self, method: str, given: tuple[object, ...]) -> object:
-        if method == "site":
-            self._port = 5000 + 100 * self.number + len(self.starts)
-            return Site(f"host{self.number}", f"10.0.0.{self.number}", self._port, self.problem)
-        if method == "start":
-            life, orders = given[0], given[5]
-            assert isinstance(life, int)
-            self._life = life
-            self.starts.append(_orders(orders))
-            self.ended = False
-            return self._pid()
-        if method == "look":
-            self._looks += 1
-            if given[1] is not None:
-                self.news.append(_orders(given[1]))
-            return Look(self._looks, self._life or -1, self._pid(), self.ended, 4, "it ended")
-        return None
-
-    def _pid(self) -> int:
-        return 1000 * (self.number if self.pids_differ else 1) + len(self.starts)
-
-
-def _orders(line: object) -> Orders:
-    assert isinstance(line, bytes)
-    return msgspec.json.decode(line, type=Orders)
-
-
-class Stage:
-    """Makes hosts, one for each call."""
-
-    def __init__(self) -> None:
-        self.hosts: list[Host] = []
-        self.prepare: Callable[[Host], None] = lambda _: None
-        self.has_room = True
-
-    def is_short(self) -> bool:
-        return not self.has_room
-
-    def asks(self, role: Role) -> str:
-        return f"1 CPU for {role.name}"
-
-    def place(self, role: Role) -> Host:
-        host = Host(len(self.hosts) + 1, role)
-        self.prepare(host)
-        self.hosts.append(host)
-        return host
-
-    def answers(self, tickets: list[object], timeout_s: float) -> Iterator[tuple[object, object]]:
-        time.sleep(timeout_s / 10)
-        for ticket in tickets:
-            assert isinstance(ticket, Call)
-            host, method, given = ticket
-            if host.is_lost:
-                yield ticket, LostError("the node died")
-            elif host.error is not None and method == host.failing:
-                yield ticket, host.error
-            elif host.has_place and not host.is_silent:
-                yield ticket, host.answer(method, given)
-
-
-@pytest.fixture
-def stage() -> Stage:
-    return Stage()
-
-
-@pytest.fixture
-def fleet(stage: Stage, tmp_path: Path) -> Iterator[Fleet]:
-    collector = ReportCollector("tcp://127.0.0.1:0", keys=new_keys())
-    with Fleet(CONFIG, tmp_path, collector, new_keys(), stage) as one:
-        yield one
-    collector.close()
-
-
-def until(condition: Callable[[], object]) -> None:
-    ends_s = time.monotonic() + 20.0
-    while not condition():
-        assert time.monotonic() < ends_s, "it did not happen within 20 s"
-        time.sleep(0.01)
+from tests.launching.cluster.stage import ACTOR, CONFIG, LEARNER, REPLAY, Host, Stage, until
 
 
 def test_roles_wait_for_places_and_are_told_where_the_servers_are(fleet: Fleet, stage: Stage) -> None:
@@ -204,40 +80,6 @@ def test_a_role_on_a_lost_host_gets_another_place(fleet: Fleet, stage: Stage) ->
     assert stage.hosts[2].is_dismissed
 
 
-def test_the_next_place_of_a_lost_server_is_found_while_the_former_life_may_still_be_ending(
-    fleet: Fleet, stage: Stage
-) -> None:
-    first = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER, ACTOR)]
-    until(lambda: all(each.pid for each in first))
-    stage.hosts[0].is_lost = True
-    until(lambda: len(stage.hosts) == 4 and fleet._kept["replay"].site is not None)
-    assert first[0].poll() is None, "an orphan has a second for its last files"
-    until(first[0].poll)
-    assert not stage.hosts[3].starts
-    again = fleet.start(REPLAY, 1, 0)
-    until(lambda: again.pid)
-    assert len(stage.hosts[3].starts) == 1
-    assert len(stage.hosts) == 4
-    until(lambda: stage.hosts[1].news)
-    replay = stage.hosts[1].news[-1].addresses.replay
-    assert replay.startswith("tcp://10.0.0.4:"), "the others hear of the place in which it lives"
-
-
-def test_a_place_in_advance_that_is_lost_as_well_is_replaced(fleet: Fleet, stage: Stage) -> None:
-    first = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER)]
-    until(lambda: all(each.pid for each in first))
-
-    def lose(host: Host) -> None:
-        host.is_lost = len(stage.hosts) == 2
-
-    stage.prepare = lose
-    stage.hosts[0].is_lost = True
-    until(first[0].poll)
-    again = fleet.start(REPLAY, 1, 0)
-    until(lambda: again.pid)
-    assert len(stage.hosts[-1].starts) == 1
-
-
 def test_a_silent_host_counts_as_lost_after_the_lease_and_not_before(fleet: Fleet, stage: Stage) -> None:
     first = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER)]
     until(lambda: all(each.pid for each in first))
@@ -274,38 +116,6 @@ def test_an_answer_that_makes_no_sense_to_the_thread_ends_the_run(fleet: Fleet, 
     until(placed.poll)
     with pytest.raises(RuntimeError, match="ZeroDivisionError"):
         fleet.start(REPLAY, 1, 0)
-
-
-def test_actors_leave_their_places_to_a_learner_that_finds_none(
-    fleet: Fleet, stage: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "PATIENCE_S", 0.2)
-    actors = [Role("actor", number) for number in range(3)]
-    placed = {role: fleet.start(role, 0, 0) for role in (REPLAY, LEARNER, *actors)}
-    until(lambda: all(each.pid for each in placed.values()))
-
-    def without_place(host: Host) -> None:
-        host.has_place = False
-
-    stage.prepare, stage.has_room, stage.hosts[1].is_lost = without_place, False, True
-    until(placed[LEARNER].poll)
-    placed[LEARNER] = fleet.start(LEARNER, 1, 0)
-    until(placed[actors[2]].poll)
-    ended = placed[actors[2]].poll()
-    assert ended is not None
-    assert ended.is_lost
-    assert stage.hosts[4].is_dismissed
-    waits = fleet.start(actors[2], 1, 0)
-    until(lambda: stage.hosts[-1].role is LEARNER)
-    num_hosts = len(stage.hosts)
-    assert placed[actors[0]].poll() is None or placed[actors[1]].poll() is not None, (
-        "one after the other, the last first"
-    )
-
-    stage.prepare, stage.has_room, stage.hosts[-1].has_place = (lambda _: None), True, True
-    until(lambda: placed[LEARNER].pid)
-    assert num_hosts == 6, "no place was asked for an actor meanwhile"
-    until(lambda: waits.pid)
 
 
 def test_news_that_a_look_could_not_carry_goes_again(fleet: Fleet, stage: Stage) -> None:
@@ -381,76 +191,6 @@ def test_a_place_of_a_further_actor_that_cannot_be_used_stays_empty(fleet: Fleet
     assert late.poll() is None
     assert not stage.hosts[3].starts
     assert not stage.hosts[3].is_dismissed, "or Ray would find the same place again"
-
-
-def test_the_first_actor_keeps_its_place_which_nobody_else_could_have(
-    fleet: Fleet, stage: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "ROOM_PERIOD_S", 0.05)
-    placed = [fleet.start(role, 0, 0) for role in (REPLAY, LEARNER, ACTOR)]
-    until(lambda: all(each.pid for each in placed))
-    asked: list[bool] = []
-
-    def short() -> bool:
-        asked.append(True)
-        return True
-
-    def without_place(host: Host) -> None:
-        host.has_place = False
-
-    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
-    stage.prepare, stage.is_short = without_place, short  # type: ignore[method-assign]
-    fleet.start(Role("evaluator", 0), 0, 0)
-    until(lambda: len(asked) > 3)
-    assert placed[2].poll() is None
-    assert not stage.hosts[2].is_dismissed
-
-
-def test_a_slow_head_of_the_cluster_holds_up_no_look(
-    fleet: Fleet, stage: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked, answered = threading.Event(), threading.Event()
-
-    def slow() -> bool:
-        asked.set()
-        answered.wait(20.0)
-        return False
-
-    stage.is_short = slow  # type: ignore[method-assign]
-    placed = [fleet.start(role, 0, 0) for role in (REPLAY, ACTOR)]
-    until(lambda: len(stage.hosts) == 2 and stage.hosts[0]._looks)
-
-    def without_place(host: Host) -> None:
-        host.has_place = False
-
-    stage.prepare = without_place
-    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
-    fleet.start(LEARNER, 0, 0)
-    assert asked.wait(20.0)
-    looks = stage.hosts[0]._looks
-    until(lambda: stage.hosts[0]._looks > looks + 2)
-    assert fleet.is_waiting, "and nobody waits for the lock"
-    assert placed[0].poll() is None
-    answered.set()
-
-
-def test_the_cluster_is_not_asked_at_every_look_whether_it_is_short(
-    fleet: Fleet, stage: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
-    asked_s: list[float] = []
-
-    def note() -> bool:
-        asked_s.append(time.monotonic())
-        return False
-
-    def without_place(host: Host) -> None:
-        host.has_place = False
-
-    stage.prepare, stage.is_short = without_place, note  # type: ignore[method-assign]
-    fleet.start(LEARNER, 0, 0)
-    until(lambda: len(asked_s) == 2)
-    assert asked_s[1] - asked_s[0] > 0.9 * module.ROOM_PERIOD_S
 
 
 @pytest.mark.parametrize("pids_differ", [True, False])

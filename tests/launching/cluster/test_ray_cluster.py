@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import json
 import logging
+import socket
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,6 +130,43 @@ def test_a_damaged_status_does_not_say_that_the_run_has_ended(tmp_path: Path, mo
     (tmp_path / "status.json").write_text("{")
     module._await_leases(Config(), tmp_path)
     assert slept_s
+
+
+def test_a_node_is_removed_or_refusing_or_nothing_is_known_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.socket() as listening, socket.socket() as closed:
+        for one in (listening, closed):
+            one.bind(("127.0.0.1", 0))
+        listening.listen()
+        closed_port = closed.getsockname()[1]
+        closed.close()
+        ports = {"well": listening.getsockname()[1], "dead": closed_port, "counted out": closed_port}
+        nodes = [
+            {"NodeID": name, "Alive": name != "counted out", "NodeManagerAddress": "127.0.0.1", "NodeManagerPort": port}
+            for name, port in ports.items()
+        ]
+        monkeypatch.setattr(ray_keepers, "_nodes", lambda: nodes)
+        placer = RayPlacer(Config(), tmp_path, "m", None, {})  # type: ignore[arg-type]
+        assert placer.fates([*ports, "forgotten"]) == {
+            "well": "unknown", "dead": "refusing", "counted out": "removed", "forgotten": "removed",
+        }  # fmt: skip
+        assert placer.fates([]) == {}
+
+
+def test_nodes_that_swallow_every_packet_are_asked_together_and_not_for_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def swallowed(*_: object) -> None:
+        await asyncio.sleep(60.0)
+
+    monkeypatch.setattr(asyncio, "open_connection", swallowed)
+    nodes = [{"NodeID": f"{i}", "Alive": True, "NodeManagerAddress": "h", "NodeManagerPort": i} for i in range(50)]
+    monkeypatch.setattr(ray_keepers, "_nodes", lambda: nodes)
+    placer = RayPlacer(Config(), tmp_path, "m", None, {})  # type: ignore[arg-type]
+    begun_s = time.monotonic()
+    assert set(placer.fates([node["NodeID"] for node in nodes]).values()) == {"unknown"}  # type: ignore[misc]
+    assert time.monotonic() - begun_s < 5.0
 
 
 def test_the_number_of_an_error_of_a_keeper_comes_along() -> None:

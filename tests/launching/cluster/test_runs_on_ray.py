@@ -88,6 +88,43 @@ def eventually(condition: Callable[[], object], within_s: float, what: str) -> N
         time.sleep(0.1)
 
 
+def test_a_place_away_from_a_node_is_on_another_inside_the_group_or_outside(cluster: Any, tmp_path: Path) -> None:
+    code = f"""
+import ray
+from pathlib import Path
+from apex_bat.config import load
+from apex_bat.launching.cluster.keeper import MARK, versions_here
+from apex_bat.launching.cluster.placement import demand_of
+from apex_bat.launching.cluster.ray_keepers import RayPlacer
+from apex_bat.roles.plan import Role
+from ray.util.placement_group import placement_group
+
+ray.init({cluster.address!r}, log_to_driver=False)
+config = load(None, ["cluster.role_cpus=0.5", "cluster.learner_resource=server"])
+role, other = Role("learner", 0), Role("actor", 7)
+demands = {{role.name: demand_of(role, config, has_gpu=False)}}
+group = placement_group(list(demands.values()), strategy="PACK")
+ray.get(group.ready())
+folder = Path({str(tmp_path)!r})
+(folder / MARK).write_text("m")
+placer = RayPlacer(config, folder, "m", group, demands)
+
+def node_of(role, away_from=""):
+    remote = placer.place(role, away_from)
+    node = ray.get(remote.call("site", versions_here(), role), timeout=60).node
+    remote.dismiss()
+    return node
+
+home = node_of(role)
+print(home != "", node_of(role, home) not in ("", home), node_of(role, "f" * 56) == home)
+print(node_of(other, home) != home)
+print(*placer.fates([home, "f" * 56]).values())
+"""
+    done = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True, timeout=120, check=False)
+    lines = done.stdout.strip().splitlines()
+    assert lines == ["True True True", "True", "unknown removed"], done.stderr
+
+
 def test_a_run_ends_with_the_same_folder_and_code_as_on_one_machine_and_can_be_resumed(
     cluster: Any, tmp_path: Path
 ) -> None:

@@ -94,6 +94,8 @@ class Kept:
         self.failed_starts = 0
         self.is_reserved = True
         """Whether the place that is reserved for the role is asked for."""
+        self.num_asks = 0
+        """How often its place was asked for in vain."""
         self.num_refusals = 0
         """How often in a row its node has said that it is gone."""
         self.is_lost = self.is_known_lost = False
@@ -156,11 +158,11 @@ class Kept:
             self.next.dismiss()
             self.next = None
 
-    def ask_anew(self, now_s: float) -> None:
-        """Takes back what was asked for in vain, and asks otherwise: for any node, or not for the reserved place."""
+    def ask_anew(self, now_s: float, *, is_reserved: bool) -> None:
+        """Takes back what was asked for in vain, and asks for the reserved place, or for one anywhere else."""
         self.dismiss()
-        self.is_reserved = bool(self.away_from) or not self.is_reserved
-        self.remote, self.away_from, self.asked_s = None, "", now_s
+        self.remote, self.away_from, self.is_reserved, self.asked_s = None, "", is_reserved, now_s
+        self.num_asks += 1
         self.under_way.clear()
 
 

@@ -25,7 +25,8 @@ SILENT_S = 2.0
 ASK_AFTER_S, ASK_PERIOD_S, MOST_REFUSALS = 1.0, 0.5, 3
 """After how long a silence the keeper's node is asked itself, how often, and how many refusals are believed."""
 OTHERWISE_S = 15.0
-"""How long a place is asked for in one way: away from a doubtful node, or the one that is reserved, or any other."""
+"""How long a place is first asked for in one way: away from a doubtful node, or the reserved one, or any other. Each
+further time takes twice as long, for a keeper may only be slow to start."""
 _LOOK_S = 0.05
 _log = logging.getLogger(__name__)
 
@@ -68,7 +69,10 @@ class Places:
     def _run(self) -> None:
         try:
             while not self._is_closed.wait(_LOOK_S):
-                self._ask_nodes(time.monotonic())
+                if time.monotonic() >= self._ask_due_s:
+                    self._ask_due_s = time.monotonic() + ASK_PERIOD_S
+                    self._ask_nodes(time.monotonic())
+                    self._ask_otherwise(time.monotonic())
                 self._look_ahead(time.monotonic())
                 self._make_room(time.monotonic())
                 self._place_all(time.monotonic())
@@ -79,30 +83,44 @@ class Places:
 
     def _ask_nodes(self, now_s: float) -> None:
         """Asks the nodes of silent keepers, of whose loss Ray tells after 12 s at the earliest, by its defaults."""
-        if now_s < self._ask_due_s:
-            return
-        self._ask_due_s = now_s + ASK_PERIOD_S
         with self._lock:
             silent = [kept for kept in self._kept.values() if self._is_silent(kept, now_s, ASK_AFTER_S)]
-            waiting = [kept for kept in with_next(self._kept.values()) if self._can_ask_anew(kept, now_s)]
-        nodes = {*(kept.doubtful_node for kept in silent), *(kept.away_from for kept in waiting)} - {""}
+            nodes = {kept.doubtful_node for kept in silent} - {""}
         fates = self._placer.fates(nodes) if nodes else {}
         now_s = time.monotonic()
         with self._lock:
+            for kept in self._kept.values():
+                if kept not in silent:
+                    kept.num_refusals = 0
             for kept in silent:
                 is_refused = fates.get(kept.doubtful_node) == "refusing" and self._is_silent(kept, now_s, ASK_AFTER_S)
                 kept.num_refusals = kept.num_refusals + 1 if is_refused else 0
                 if kept.num_refusals >= MOST_REFUSALS:
                     _log.warning("%s: its node refuses connections: Ray has ended there", kept.role.name)
                     kept.lose("its node refuses connections")
-            for kept in waiting:
-                patience_s = PATIENCE_S if fates.get(kept.away_from) == "removed" else OTHERWISE_S
-                if kept.waits_s(now_s) > patience_s:
-                    kept.ask_anew(now_s)
 
-    def _can_ask_anew(self, kept: Kept, now_s: float) -> bool:
-        """Whether a keeper's place is asked for in vain, and there is another way to ask."""
-        return kept.waits_s(now_s) > 0.0 and (bool(kept.away_from) or self._placer.reserves(kept.role))
+    def _ask_otherwise(self, now_s: float) -> None:
+        """Asks in another way for places that were asked for in vain."""
+        with self._lock:
+            everyone = with_next(self._kept.values())
+            waiting = [kept for kept in everyone if kept.away_from or self._placer.reserves(kept.role)]
+            waiting = [kept for kept in waiting if self._impatience(kept, now_s) > 0.5]
+        if not waiting:
+            return
+        nodes = {kept.away_from for kept in waiting} - {""}
+        fates = self._placer.fates(nodes) if nodes else {}
+        is_short = self._placer.is_short()
+        with self._lock:
+            for kept in waiting:
+                share = self._impatience(kept, now_s)  # none if a place was found meanwhile
+                if kept.away_from and share > (0.5 if fates[kept.away_from] == "removed" else 1.0):
+                    kept.ask_anew(now_s, is_reserved=True)
+                elif not kept.away_from and share > 1.0 and kept.is_reserved == is_short:
+                    kept.ask_anew(now_s, is_reserved=not is_short)
+
+    def _impatience(self, kept: Kept, now_s: float) -> float:
+        """Returns how long a place has been asked for in one way, as a share of the longest that this may take."""
+        return kept.waits_s(now_s) / (OTHERWISE_S * 2.0**kept.num_asks)
 
     def _look_ahead(self, now_s: float) -> None:
         """Asks for a next place for what is lost or silent, and gives it back when that is heard again."""

@@ -7,6 +7,7 @@ exit codes.
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
@@ -25,6 +26,7 @@ from apex_bat.roles.plan import Role
 own_address: Callable[[], str] = ray.util.get_node_ip_address
 _nodes: Callable[[], list[dict[str, Any]]] = ray.nodes
 _CONNECT_S = 0.4
+_log = logging.getLogger(__name__)
 
 
 class RayPlacer:
@@ -83,7 +85,11 @@ class RayPlacer:
 
     def fates(self, nodes: Collection[str]) -> dict[str, Fate]:
         """Returns what is known of nodes: from Ray, or from the port of its daemon there."""
-        known = {node["NodeID"]: node for node in _nodes()}
+        try:
+            known = {node["NodeID"]: node for node in _nodes()}
+        except (ray.exceptions.RayError, OSError) as error:
+            _log.warning("the head of the cluster does not answer: %s", error)
+            return dict.fromkeys(nodes, "unknown")
         living = {node: known[node] for node in nodes if node in known and known[node]["Alive"]}
         ports = [(str(node["NodeManagerAddress"]), int(node["NodeManagerPort"])) for node in living.values()]
         refusing = dict(zip(living, asyncio.run(_refusing(ports)), strict=True))

@@ -179,8 +179,7 @@ def test_a_node_that_refuses_now_and_then_or_is_heard_is_believed_to_live(
 def test_a_role_waits_for_a_place_away_from_a_node_until_that_is_removed_or_patience_ends(
     fate: Fate, fleet: Fleet, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "PATIENCE_S", 0.1)
-    monkeypatch.setattr(module, "OTHERWISE_S", 1.0 if fate == "unknown" else 60.0)
+    monkeypatch.setattr(module, "OTHERWISE_S", 3.0 if fate == "unknown" else 60.0)
     _, learner = work(fleet, REPLAY, LEARNER)
 
     def full(host: Host) -> None:
@@ -190,10 +189,14 @@ def test_a_role_waits_for_a_place_away_from_a_node_until_that_is_removed_or_pati
     stage.hosts[1].is_silent = True
     until(learner.poll)
     again = fleet.start(LEARNER, 1, 0)
+    begun_s = time.monotonic()
     time.sleep(0.3)
     assert not again.pid
-    stage.fate["node2"] = fate
+    if fate == "removed":
+        monkeypatch.setattr(module, "OTHERWISE_S", 1.0)
+        stage.fate["node2"] = fate
     until(lambda: again.pid)
+    assert (time.monotonic() - begun_s > 2.5) == (fate == "unknown"), "half the patience, if there is nothing to avoid"
     assert stage.hosts[-1].away_from == ""
     assert all(host.is_dismissed for host in stage.hosts if host.away_from), "or it would hold a place for nobody"
 
@@ -207,8 +210,7 @@ def test_a_role_whose_reserved_place_does_not_come_back_takes_another(
         host.has_place = not host.is_reserved
 
     *_, actor = work(fleet, REPLAY, LEARNER, ACTOR)
-    stage.prepare = without_group
-    stage.hosts[2].is_lost = True
+    stage.prepare, stage.has_room, stage.hosts[2].is_lost = without_group, False, True
     until(actor.poll)
     again, further = fleet.start(ACTOR, 1, 0), fleet.start(Role("actor", 1), 0, 0)
     until(lambda: again.pid)
@@ -217,6 +219,24 @@ def test_a_role_whose_reserved_place_does_not_come_back_takes_another(
     assert hosts[0].is_dismissed
     assert not further.pid
     assert len([host for host in stage.hosts if host.role.number == 1]) == 1, "nothing is reserved for it: it waits"
+
+
+def test_a_keeper_that_is_slow_to_start_in_its_reserved_place_is_waited_for(
+    fleet: Fleet, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "OTHERWISE_S", 0.1)
+    monkeypatch.setattr(module, "ASK_PERIOD_S", 0.02)
+
+    def slow(host: Host) -> None:
+        host.has_place = False
+
+    stage.prepare = slow
+    replay, learner = (fleet.start(role, 0, 0) for role in (REPLAY, LEARNER))
+    time.sleep(1.0)
+    assert len(stage.hosts) == 2, "the group has its places: nothing else is there to ask for"
+    for host in stage.hosts:
+        host.has_place = True
+    until(lambda: replay.pid and learner.pid)
 
 
 def test_a_keeper_that_was_ended_here_is_not_known_to_be_lost(fleet: Fleet, stage: Stage) -> None:

@@ -219,6 +219,8 @@ class Fleet:
         elif kept.is_in_advance and isinstance(answer, Site):  # the life that begins there asks again
             kept.site = answer
             kept.hearing.take(time.monotonic())
+            if has_reserve(kept.role, self._config) and not answer.problem:
+                kept.ask("prepare", kept.role, threads_of(kept.role, self._config))
         elif isinstance(answer, Exception):
             self._take_error(kept, placed, method, answer)
         elif isinstance(answer, Site):

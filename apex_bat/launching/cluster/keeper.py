@@ -118,6 +118,13 @@ class Keeper:
         port = free_port(self._address, self._base_port, first_port(role)) if listens and not problem else 0
         return Site(socket.gethostname(), self._address, port, problem, self._node)
 
+    def prepare(self, role: Role, num_threads: int) -> None:
+        """Lets a process in reserve import what the role needs, while it may not begin here yet."""
+        if self._reserve is None:
+            _show_package_to_children()
+            self._reserve = self._recipe(role, num_threads).reserve()
+            self._reserve.tend()
+
     def start(
         self, life: int, role: Role, incarnation: int, num_threads: int, flown_steps: int, orders: bytes,
         has_reserve: bool = False,
@@ -143,7 +150,7 @@ class Keeper:
         if self._lease.has_lapsed:
             return 0
         _show_package_to_children()
-        recipe = Recipe(role, self._run, num_threads, is_ordered=True, folder=self._folder)
+        recipe = self._recipe(role, num_threads)
         if has_reserve and self._reserve is None:
             self._reserve = recipe.reserve()
         self._process = RoleProcess(
@@ -190,6 +197,9 @@ class Keeper:
         self.kill()
         if self._reserve is not None:
             self._reserve.close()
+
+    def _recipe(self, role: Role, num_threads: int) -> Recipe:
+        return Recipe(role, self._run, num_threads, is_ordered=True, folder=self._folder)
 
     def _watch_lease(self) -> None:
         """Kills the role when the lease lapses.

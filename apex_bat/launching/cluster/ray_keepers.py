@@ -130,6 +130,9 @@ class _RemoteKeeper:
     def site(self, versions: tuple[str, str], role: Role) -> Site:
         return self._keeper.site(versions, role)
 
+    def prepare(self, *given: Any) -> None:
+        self._keeper.prepare(*given)
+
     def start(self, *given: Any) -> int:
         return self._keeper.start(*given)
 

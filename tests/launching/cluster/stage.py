@@ -46,6 +46,7 @@ class Host:
         """The method that is answered by `error`, while there is one."""
         self.starts: list[Orders] = []
         self.news: list[Orders] = []
+        self.prepared: list[Role] = []
         self.ended = False
         self._looks = self._life = 0
 
@@ -70,6 +71,8 @@ class Host:
             self.starts.append(_orders(orders))
             self.ended = False
             return self._pid()
+        if method == "prepare":
+            self.prepared.append(self.role)
         if method == "look":
             self._looks += 1
             if given[1] is not None:

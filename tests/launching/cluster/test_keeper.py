@@ -134,6 +134,33 @@ def test_a_role_has_a_reserve_where_one_is_asked_for_until_it_is_to_end(
     assert Process.made[-1].reserve is None
 
 
+def test_what_was_prepared_before_the_role_may_begin_is_its_reserve(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits = [sys.executable, "-c", "import sys; sys.stdin.read()"]
+    started: list[Recipe] = []
+
+    def begin(recipe: Recipe, *words: str) -> subprocess.Popen[bytes]:
+        assert words == ("--reserve",)
+        started.append(recipe)
+        return subprocess.Popen(waits, stdin=subprocess.PIPE)
+
+    monkeypatch.setattr(Recipe, "start", begin)
+    keeper = make()
+    for _ in range(2):
+        keeper.prepare(ACTOR, 3)
+    (recipe,) = started
+    assert (recipe.role, recipe.num_threads, recipe.is_ordered) == (ACTOR, 3, True)
+    assert not Process.made, "the role has not begun"
+    keeper.start(1, ACTOR, 7, 3, 500, b"first\n", True)
+    reserve = Process.made[0].reserve
+    assert reserve is not None
+    waiting = reserve._process
+    assert waiting is not None
+    keeper.close()
+    assert waiting.wait(10.0) == 0
+
+
 def test_a_second_start_ends_the_first_process(make: Make) -> None:
     keeper = make()
     start(keeper)

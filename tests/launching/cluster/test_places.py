@@ -101,11 +101,13 @@ def test_a_silent_server_gets_its_next_place_away_from_its_node_before_its_lease
     until_next(fleet, LEARNER)
     assert learner.poll() is None
     assert stage.hosts[3].away_from == "node2"
+    until(lambda: stage.hosts[3].prepared == [LEARNER])
     until(learner.poll)
     assert not stage.hosts[3].starts, "nobody twice"
     again = fleet.start(LEARNER, 1, 0)
     until(lambda: again.pid)
     assert [len(host.starts) for host in stage.hosts] == [1, 1, 1, 1]
+    assert not any(host.prepared for host in stage.hosts[:3])
     assert stage.hosts[1].is_dismissed
 
 

@@ -113,9 +113,9 @@ class Places:
         with self._lock:
             for kept in waiting:
                 share = self._impatience(kept, now_s)  # none if a place was found meanwhile
-                if kept.away_from and share > (0.5 if fates[kept.away_from] == "removed" else 1.0):
-                    kept.ask_anew(now_s, is_reserved=True)
-                elif not kept.away_from and share > 1.0 and kept.is_reserved == is_short:
+                is_late = share > (0.5 if fates.get(kept.away_from) == "removed" else 1.0)
+                is_in_group = kept.is_reserved and not kept.away_from
+                if is_late and is_in_group == is_short:  # where there is none, or not where there is one
                     kept.ask_anew(now_s, is_reserved=not is_short)
 
     def _impatience(self, kept: Kept, now_s: float) -> float:

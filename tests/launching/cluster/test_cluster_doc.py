@@ -24,6 +24,15 @@ def test_every_fault_was_measured_and_a_role_that_was_cut_off_ended_within_its_l
     assert all(one["from_host"] != one["to_host"] for one in cut)
 
 
+def test_every_role_worked_again_within_its_target() -> None:
+    late = {
+        one["fault"]: one["recovered_s"]
+        for one in RESULT["faults"]
+        if one["recovered_s"] > TARGET_S.get(one["fault"], 60.0)
+    }
+    assert not late
+
+
 def test_the_training_across_hosts_is_that_of_the_result() -> None:
     result = json.loads((ROOT / "docs" / "results" / "cluster_training.json").read_text(encoding="utf-8"))
     training, text = result["training"], " ".join(PAGE.split())

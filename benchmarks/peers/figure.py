@@ -63,6 +63,11 @@ def draw(all_groups: Sequence[Group], path: Path) -> None:
         str(line.get_label()): line for axes in figure.axes for line in axes.lines if line.get_marker() != "None"
     }
     figure.legend(
-        list(handles.values()), list(handles), fontsize=SMALL, frameon=False, loc="outside upper center", ncols=6
+        list(handles.values()),
+        list(handles),
+        fontsize=SMALL,
+        frameon=False,
+        loc="outside upper center",
+        ncols=2 if len(figure.axes) == 1 else 6,
     )
     figure.savefig(path, dpi=2 * PNG_DPI, metadata={"Software": None})

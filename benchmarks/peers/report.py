@@ -174,6 +174,9 @@ def document(content: dict[str, Any], trials: Sequence[Result]) -> str:
     lines = [HEAD, ""]
     for environment in ENVIRONMENTS:
         budgets_s = sorted({group.budget_s for group in all_groups if group.environment == environment})
+        if not budgets_s:
+            lines += [f"## The {environment} environment", "", goal(all_groups, environment), ""]
+            continue
         budget = " and ".join(f"{budget_s:.0f}" for budget_s in budgets_s)
         lines += [f"## The {environment} environment", "", f"{budget} s each. {goal(all_groups, environment)}", ""]
         lines += [*table(all_groups, environment), ""]
@@ -246,7 +249,7 @@ def _circumstances(content: dict[str, Any]) -> list[str]:
         _command(results),
         "```",
         "",
-        "Every figure of every seed is in `peers.json`. Three seeds are few: their least and greatest are all that "
+        "Every figure of every seed is in `peers.json`. So few seeds say little: their least and greatest are all that "
         "can be said of the spread.",
     ]
 

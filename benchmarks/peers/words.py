@@ -41,6 +41,18 @@ What differs, because a library has it so:
 """
 
 CAUSES = """## Where the time goes
+
+apex_bat and Stable-Baselines3 make about as many steps and updates a second: on two cores an update is the limit of
+both. apex_bat's learner fills one core with them; actor, replay server, evaluator and launcher need about half of
+the other. What it gains is that it needs fewer steps and updates: priorities, an epsilon for each bat, half of each
+batch mirrored, the average of the network judged. Tianshou and RLlib need more steps than apex_bat, too, and make
+less than half as many a second, with the same network and environment; what they spend the rest on was not
+profiled.
+
+So the goal in the registered environment is missed for want of updates. Tried for faster ones, each beside what is
+there on the same machine, and without a gain that stood out of its noise: gradients by hand instead of by autograd,
+all parameters in one tensor for the optimiser, an allocator that keeps its memory. A search over actors, bats,
+samples per insert, batch and learning rate ([tune.md](tune.md)) found one actor better than two, and nothing else.
 """
 
 TRIALS = """Short trainings by which the peers' settings were chosen. They ran beside other work: times and rates are

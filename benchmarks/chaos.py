@@ -32,8 +32,11 @@ KINDS = (
     "kill actor", "kill replay", "kill learner", "kill evaluator", "kill two", "stop one", "kill in checkpoint",
     "kill in snapshot",
 )  # fmt: skip
-CHAOS_SETTINGS = ("launch.heartbeat_timeout_s=5.0", "checkpoint.period_s=10.0", "replay.snapshot_period_s=20.0")
-"""What differs from the configuration: hangs are noticed sooner, and files are written often enough to be hit."""
+CHAOS_SETTINGS = (
+    "actors=2", "launch.heartbeat_timeout_s=5.0", "checkpoint.period_s=10.0", "replay.snapshot_period_s=20.0",
+)  # fmt: skip
+"""What differs from the configuration: as many actors on any machine, of which one flies on while the other is hit;
+hangs are noticed sooner, and files are written often enough to be hit."""
 LOOK_S, WATCH_S = 0.05, 0.0005
 """Time between looks at status.json, and at a folder in which a file is about to be written."""
 WARM_UP_S = 10.0

@@ -14,24 +14,26 @@ from typing import Any
 FILE = Path(__file__).resolve().parents[1] / "docs" / "results" / "tune.json"
 HEAD = """# The search for settings
 
-Made by `python -m benchmarks.tune` (see there) on {cores} cores, nothing else running: the time from the first
-environment step until a policy completes 14 of 15 flights in simple, in the condition memory. The evaluator judges
-every {period_s:g} s, so differences below that say nothing; a trial ends after {limit_s:g} s, and where 14 never came,
-its value is that and as much again as flights were missing. `*` marks what shipped until then, the first trial.
+The time from the start of `apex-bat train` to the first policy that completes 14 of 15 flights in simple, in the
+condition memory, on {cores} cores, nothing else running. Each number is one training of {limit_s:g} s, whose policies
+are written every {period_s:g} s and judged afterwards; where none completed 14, it is {limit_s:g} and as much again as
+flights were missing. `*` marks what shipped until then. The last command was
 
-What came of it: one actor flies as many steps as two where they share two cores with the learner, and each of the four
-seeds reached 14 of 15 sooner with it. So the configurations for the bat have `actors = "auto"` now: the cores less two,
-at least one. Nothing else that was found is better by more than it varies; it stayed as it was.
+    {command}
+
+{outcome}
 
 ## Trained anew
 
-The best trials and what ships, by turns, with seeds that no trial had; judged every {new_period_s:g} s.
+What shipped, some changes of it, and the best trials, by turns, with seeds that no trial had.
 
 """
+OUTCOME = """"""
 TRIALS = """
 ## Trials
 
-Each with another seed; the best first.
+Proposed by Optuna, the first {random} at random; each with another seed, so neighbours differ by chance, too. The best
+first.
 
 """
 
@@ -52,10 +54,11 @@ def page(content: Mapping[str, Any]) -> str:
             cores=content["machine"]["cores"],
             period_s=content["period_s"],
             limit_s=content["limit_s"],
-            new_period_s=content["new_period_s"],
+            command=content["command"],
+            outcome=OUTCOME,
         )
         + _table(["median [s]", "of the seeds [s]", "", *names], anew)
-        + TRIALS
+        + TRIALS.format(random=content["num_random"])
         + _table(["[s]", "flights completed, at most", "", *names], rows)
     )
 

@@ -29,12 +29,10 @@ from torch import nn
 
 from benchmarks.peers.environments import obvious, registered
 from benchmarks.peers.network import Features, FlatDueling, named
-from benchmarks.peers.terms import EPSILON_STEPS, EPSILONS, NUM_BATS, NUM_OBVIOUS, terms, updates_of
+from benchmarks.peers.terms import EPSILON_STEPS, EPSILONS, NUM_OBVIOUS, terms, updates_of
 from benchmarks.peers.training import Task
 
-SETTINGS: dict[str, float] = {
-    "threads": 1, "bats": NUM_BATS, "learning_rate": 0.00025, "adam": 0, "runners": 2, "fragment": 4,
-}  # fmt: skip
+OWN: dict[str, float] = {"runners": 2, "fragment": 4}
 REPORT_STEPS = 500
 """Steps that the algorithm samples between two looks at the notebook; each look costs it a report of its own."""
 STORE_BYTES = 200_000_000
@@ -42,7 +40,7 @@ STORE_BYTES = 200_000_000
 
 def train(task: Task) -> None:
     """Trains until the budget is spent."""
-    chosen = SETTINGS | task.overrides
+    chosen = task.settings(OWN)
     torch.set_num_threads(int(chosen["threads"]))
     os.environ.update(HOME=str(task.folder), RAY_USAGE_STATS_ENABLED="0")
     ray.init(
@@ -90,7 +88,7 @@ def _config(task: Task, chosen: dict[str, float]) -> Any:
         .training(
             lr=chosen["learning_rate"], gamma=learner.discount, n_step=learner.num_step, double_q=True, dueling=True,
             train_batch_size_per_learner=learner.batch_size, num_atoms=1, td_error_loss_fn="mse",
-            target_network_update_freq=round(learner.target_period / updates_of(1, task.config)),
+            target_network_update_freq=round(chosen["target_period"] / updates_of(1, task.config)),
             num_steps_sampled_before_learning_starts=replay.min_size, grad_clip=learner.gradient_clip,
             training_intensity=round(updates) * learner.batch_size / counted_steps,
             epsilon=[(0, EPSILONS[0]), (EPSILON_STEPS, EPSILONS[1])],

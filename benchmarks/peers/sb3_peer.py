@@ -1,6 +1,6 @@
 """Stable-Baselines3's DQN: n-step, without double Q-learning, dueling streams or priorities, which it does not have.
 
-Tried and documented in docs/results/peers.md: optimiser, learning rate, threads of torch, number of bats.
+What was tried of its settings is in docs/results/peers.md.
 """
 
 from __future__ import annotations
@@ -19,16 +19,15 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from apex_bat.config import Config
 from benchmarks.peers.environments import Swarm, obvious
 from benchmarks.peers.network import Features, named, single_width
-from benchmarks.peers.terms import EPSILON_STEPS, EPSILONS, NUM_BATS, NUM_OBVIOUS, updates_of
+from benchmarks.peers.terms import EPSILON_STEPS, EPSILONS, NUM_OBVIOUS, updates_of
 from benchmarks.peers.training import Task
 
-SETTINGS: dict[str, float] = {"threads": 1, "bats": NUM_BATS, "learning_rate": 0.00025, "adam": 0}
 NEVER = 100_000_000  # steps: the budget ends the training
 
 
 def train(task: Task) -> None:
     """Trains until the budget is spent."""
-    chosen = SETTINGS | task.overrides
+    chosen = task.settings()
     torch.set_num_threads(int(chosen["threads"]))
     config = task.config
     num_bats = int(chosen["bats"]) if task.environment == "registered" else NUM_OBVIOUS
@@ -47,7 +46,7 @@ def train(task: Task) -> None:
         "MlpPolicy", env, learning_rate=chosen["learning_rate"], buffer_size=replay.capacity,
         learning_starts=replay.min_size, batch_size=learner.batch_size, gamma=learner.discount, train_freq=1,
         gradient_steps=round(updates_of(num_bats, config)), n_steps=learner.num_step,
-        target_update_interval=round(learner.target_period / updates_of(1, config)),
+        target_update_interval=round(chosen["target_period"] / updates_of(1, config)),
         exploration_initial_eps=EPSILONS[0], exploration_final_eps=EPSILONS[1],
         exploration_fraction=EPSILON_STEPS / NEVER, max_grad_norm=learner.gradient_clip, seed=task.seed, device="cpu",
         policy_kwargs={

@@ -22,16 +22,15 @@ from tianshou.trainer import OffPolicyTrainer, OffPolicyTrainerParams
 from apex_bat.config import Config
 from benchmarks.peers.environments import Swarm, flat_space, obvious
 from benchmarks.peers.network import FlatDueling, named
-from benchmarks.peers.terms import NUM_BATS, NUM_OBVIOUS, epsilon_at, terms, updates_of
+from benchmarks.peers.terms import NUM_OBVIOUS, epsilon_at, terms, updates_of
 from benchmarks.peers.training import Task
 
-SETTINGS: dict[str, float] = {"threads": 1, "bats": NUM_BATS, "learning_rate": 0.00025, "adam": 0}
 EPOCH_STEPS = 1600  # between looks whether the budget is spent
 
 
 def train(task: Task) -> None:
     """Trains until the budget is spent."""
-    chosen = SETTINGS | task.overrides
+    chosen = task.settings()
     torch.set_num_threads(int(chosen["threads"]))
     torch.manual_seed(task.seed)
     np.random.seed(task.seed)  # noqa: NPY002  # Tianshou draws from the global generator
@@ -91,7 +90,7 @@ def _algorithm(config: Config, chosen: dict[str, float]) -> CountedDQN:
     )
     return CountedDQN(
         policy=policy, optim=optimiser, gamma=learner.discount, n_step_return_horizon=learner.num_step,
-        target_update_freq=learner.target_period, is_double=True,
+        target_update_freq=int(chosen["target_period"]), is_double=True,
     )  # fmt: skip
 
 

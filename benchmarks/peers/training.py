@@ -8,13 +8,15 @@ from __future__ import annotations
 import argparse
 import json
 import os
+from collections.abc import Mapping
 from importlib import import_module, metadata
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from apex_bat.config import Config
 from benchmarks.peers.notebook import Notebook
-from benchmarks.peers.terms import ENVIRONMENTS, Environment, entry_of, terms
+from benchmarks.peers.terms import ENVIRONMENTS, NUM_BATS, Environment, entry_of, terms
 
 VERSIONS = "versions.json"
 
@@ -30,6 +32,25 @@ class Task(NamedTuple):
     """For whatever the library writes."""
     overrides: dict[str, float]
     """The peer's own settings that a trial changes."""
+
+    def settings(self, own: Mapping[str, float] = MappingProxyType({})) -> dict[str, float]:
+        """Returns the settings of a peer that a trial may change, with its changes.
+
+        Args:
+            own: what only this library has.
+
+        Raises:
+            ValueError: a trial changes what there is not.
+        """
+        learner = self.config.learner
+        shared = {
+            "threads": 1, "bats": NUM_BATS, "adam": 0, "learning_rate": learner.learning_rate,
+            "target_period": learner.target_period,
+        }  # fmt: skip
+        there = {**shared, **own}
+        if unknown := sorted(self.overrides.keys() - there):
+            raise ValueError(f"no setting {', '.join(unknown)}; there are {', '.join(there)}")
+        return there | self.overrides
 
 
 def main() -> None:

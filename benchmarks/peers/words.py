@@ -31,7 +31,8 @@ What differs, because a library has it so:
 
 | | differs |
 |---|---|
-| apex_bat | 32 bats in two processes, each with an epsilon of its own (Ape-X); half of each batch mirrored |
+| apex_bat | 16 bats in one process (`actors = "auto"` on two cores), each with an epsilon of its own (Ape-X) |
+| apex_bat | half of each batch is mirrored |
 | apex_bat | judged is the average of its network over 1,500 updates, at first over a tenth of those so far |
 | all peers | one epsilon for all bats, from 1.0 to 0.05 over 20,000 steps; 16 bats |
 | Tianshou | new transitions get the greatest priority so far |

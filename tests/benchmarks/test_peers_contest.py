@@ -14,9 +14,10 @@ from apex_bat.roles import checkpoint
 from benchmarks.peers import apex_bat_entry, contest
 from benchmarks.peers.contest import Options, PeerError, Start, hold, result_of, starts
 from benchmarks.peers.judging import Judgement
-from benchmarks.peers.notebook import Row
+from benchmarks.peers.notebook import Notebook, Row
 from benchmarks.peers.process_tree import ProcessTree, Sample
 from benchmarks.peers.terms import ABLATIONS, ENTRIES, entry_of, epsilon_at, terms, updates_of
+from benchmarks.peers.training import Task
 
 
 def options(tmp_path: Path, **changes: Any) -> Options:
@@ -154,3 +155,15 @@ def set_time(path: Path, unix_s: float) -> None:
 def test_the_peers_learn_as_often_as_apex_bat_and_explore_less_and_less() -> None:
     assert updates_of(16, terms()) == pytest.approx(2.0)
     assert [epsilon_at(steps) for steps in (0, 10_000, 20_000, 90_000)] == pytest.approx([1.0, 0.525, 0.05, 0.05])
+
+
+def test_a_trial_changes_settings_of_a_peer_and_none_that_it_does_not_have(tmp_path: Path) -> None:
+    def task(**overrides: float) -> Task:
+        return Task("registered", 0, terms(), Notebook(tmp_path, terms(), 0.0, 1.0, 1.0), tmp_path, overrides)
+
+    shared = task().settings()
+    assert shared["learning_rate"] == terms().learner.learning_rate
+    assert shared["target_period"] == terms().learner.target_period
+    assert task(adam=1.0, runners=1.0).settings({"runners": 2.0}) == shared | {"adam": 1.0, "runners": 1.0}
+    with pytest.raises(ValueError, match="no setting runners; there are threads, bats, adam, learning_rate"):
+        task(runners=1.0).settings()

@@ -2,15 +2,14 @@
 
 import json
 import math
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from apex_bat.config import load
 from benchmarks import tune
+from benchmarks.peers import contest
+from benchmarks.peers.terms import CONFIG_FILE, terms
 from benchmarks.tune import Seen, again, changed, propose, search, see, train, value_of
 from benchmarks.tune_page import FILE, page
 
@@ -68,8 +67,7 @@ def test_every_trial_is_told_with_its_time_and_has_a_seed_of_its_own() -> None:
 
 def test_the_search_begins_with_what_ships_within_the_bounds_of_the_search() -> None:
     shipped = tune.shipped()
-    config = load(Path(tune.CONFIG), [f"{name}={number}" for name, number in shipped.items()])
-    assert config == load(Path(tune.CONFIG))
+    assert load(CONFIG_FILE, [f"{name}={number}" for name, number in shipped.items()]) == terms()
     asked = dict[str, Any]()
 
     class Bounds(FakeTrial):
@@ -100,16 +98,21 @@ def test_settings_are_trained_anew_by_turns() -> None:
     assert order == [(1, 1), (2, 1), (1, 2), (2, 2)]
 
 
-def test_one_setting_is_changed_alone() -> None:
-    assert changed({"actors": 2, "replay.samples_per_insert": 8.0}, "actors=1") == {
-        "actors": 1, "replay.samples_per_insert": 8.0,
-    }  # fmt: skip
+def test_what_ships_is_changed_in_what_is_named_alone() -> None:
+    shipped = {"actors": 2, "replay.samples_per_insert": 8.0, "learner.batch_size": 64}
+    assert changed(shipped, "actors=1") == shipped | {"actors": 1}
+    both = changed(shipped, "actors=1,replay.samples_per_insert=4")
+    assert both == shipped | {"actors": 1, "replay.samples_per_insert": 4.0}
+    assert isinstance(both["replay.samples_per_insert"], float)
+    with pytest.raises(KeyError, match="actor"):
+        changed(shipped, "actor=1")
 
 
 def test_the_page_shows_what_ships_beside_what_was_found() -> None:
     shipped, found = {"actors": 2, "learner.learning_rate": 2.5e-4}, {"actors": 1, "learner.learning_rate": 1e-3}
     text = page({
-        "machine": {"cores": 2}, "limit_s": 240.0, "period_s": 20.0, "new_period_s": 10.0, "shipped": shipped,
+        "machine": {"cores": 2}, "limit_s": 60.0, "period_s": 3.0, "shipped": shipped, "command": "search it",
+        "num_random": 1,
         "trials": [
             {"settings": shipped, "value_s": 66.4, "most": 14}, {"settings": found, "value_s": 50.2, "most": 15},
         ],
@@ -133,43 +136,24 @@ def test_what_never_got_there_is_worse_than_what_did_and_better_the_more_it_comp
 
 def test_every_proposed_setting_exists() -> None:
     overrides = [f"{name}={number}" for name, number in propose(FakeTrial(0)).items()]
-    assert load(None, overrides).learner.learning_rate == 5e-5
+    assert load(None, overrides).learner.learning_rate == 1e-4
 
 
-def test_the_first_row_with_enough_flights_gives_the_time() -> None:
-    rows: list[dict[str, Any]] = [
-        {"elapsed_s": 5.0}, {"elapsed_s": 30.0, "completed_share": 13 / 15},
-        {"elapsed_s": 50.0, "completed_share": 14 / 15}, {"elapsed_s": 70.0, "completed_share": 1.0},
+def test_the_first_policy_with_enough_flights_gives_the_time_and_what_was_not_judged_gives_none() -> None:
+    curve = [
+        {"wall_s": time_s, "completed": completed}
+        for time_s, completed in ((5.0, 2), (8.0, 13), (11.0, None), (14.0, 15))
     ]  # fmt: skip
-    assert see(iter(rows)) == Seen(50.0, 14)
-    assert see(iter(rows[:2])) == Seen(math.inf, 13)
+    assert see(curve) == Seen(14.0, 15)
+    assert see(curve[:3]) == Seen(math.inf, 13)
 
 
-def _stand_in(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
-    """Starts another program instead of a training; it gets the run folder as its last argument."""
-    popen = subprocess.Popen
+def test_a_training_is_one_of_the_contest_with_other_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(start: contest.Start, options: contest.Options) -> contest.Result:
+        assert (start.entry.name, start.environment, start.seed) == ("apex_bat", "registered", 7)
+        assert start.entry.settings == ("actors=1", "learner.batch_size=32")
+        assert (options.budgets_s["registered"], options.every_s) == (50.0, tune.PERIOD_S)
+        return {"curve": [{"wall_s": 21.0, "completed": 14}]}
 
-    def start(command: list[str], **kwargs: Any) -> Any:
-        assert command[1:4] == ["-m", "apex_bat", "train"]
-        run = command[command.index("--run") + 1]
-        (Path(run) / "metrics").mkdir(parents=True)
-        return popen([sys.executable, "-c", code, f"{run}/metrics/evaluator.jsonl"], **kwargs)
-
-    monkeypatch.setattr(tune.subprocess, "Popen", start)  # type: ignore[attr-defined]
-    monkeypatch.setattr(tune, "LOOK_S", 0.01)
-
-
-def test_a_training_ends_when_enough_flights_were_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    row = json.dumps({"elapsed_s": 42.0, "completed_share": 1.0})
-    _stand_in(
-        monkeypatch,
-        "import signal, sys\nsignal.signal(signal.SIGINT, lambda *_: sys.exit(130))\n"
-        f"open(sys.argv[1], 'w').write({row!r} + chr(10) + '{{')\nsignal.pause()\n",
-    )
-    assert train({"actors": 1}, 3, 600.0, tmp_path) == Seen(42.0, 15)
-
-
-def test_a_training_that_fails_is_no_value(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _stand_in(monkeypatch, "raise SystemExit(2)")
-    with pytest.raises(RuntimeError, match="code 2"):
-        train({"actors": 1}, 3, 600.0, tmp_path)
+    monkeypatch.setattr(contest, "run", run)
+    assert train({"actors": 1, "learner.batch_size": 32}, 7, 50.0) == Seen(21.0, 14)

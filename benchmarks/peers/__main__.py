@@ -20,7 +20,7 @@ import sys
 from pathlib import Path
 
 from apex_bat.launching import ONE_THREAD
-from benchmarks.peers.contest import Options, hold, starts
+from benchmarks.peers.contest import Options, PeerError, hold, starts
 from benchmarks.peers.report import TRIALS_SUFFIX as TRIALS
 from benchmarks.peers.report import write
 from benchmarks.peers.terms import ENTRIES, ENVIRONMENTS, Environment, entry_of
@@ -50,9 +50,12 @@ def main() -> int:
     for name in ONE_THREAD:  # in the processes that judge: idle BLAS threads that spin halve the simulation's rate
         os.environ.setdefault(name, "1")
     has_failed = False
-    for line in hold(starts(entries, environments, given.seeds), options):
-        print(line, flush=True)
-        has_failed |= ": failed: " in line
+    try:
+        for line in hold(starts(entries, environments, given.seeds), options):
+            print(line, flush=True)
+            has_failed |= ": failed: " in line
+    except PeerError as error:
+        parser.error(str(error))
     if given.file.exists() and not given.file.stem.endswith(TRIALS):
         print(f"written: {write(given.file)}")
     return int(has_failed)

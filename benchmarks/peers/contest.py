@@ -20,6 +20,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from apex_bat.launching import ONE_THREAD
@@ -83,12 +84,12 @@ def starts(entries: Sequence[Entry], environments: Sequence[Environment], num_se
     ]
 
 
-def load_results(file: Path) -> list[Result]:
-    """Returns the results in a file; none if there is no file."""
+def load(file: Path) -> dict[str, Any]:
+    """Returns what is in a file of results; no results if there is no file."""
     if not file.exists():
-        return []
-    results: list[Result] = json.loads(file.read_text(encoding="utf-8"))["results"]
-    return results
+        return {"results": []}
+    content: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return content
 
 
 def is_done(start: Start, options: Options, results: Sequence[Result]) -> bool:
@@ -102,9 +103,18 @@ def is_done(start: Start, options: Options, results: Sequence[Result]) -> bool:
 
 
 def hold(all_starts: Sequence[Start], options: Options) -> Iterator[str]:
-    """Runs what is not done yet and keeps each result; yields a line about each training."""
+    """Runs what is not done yet and keeps each result; yields a line about each training.
+
+    Raises:
+        PeerError: the file holds results of other settings.
+    """
+    shared = json.loads(msgspec.json.encode(terms()))
     for start in all_starts:
-        results = load_results(options.file)
+        content = load(options.file)
+        if content.get("terms", shared) != shared:
+            raise PeerError(f"{options.file} holds results of other settings than configs/memory.toml has now: give "
+                            "another file to --json, or put that one away")  # fmt: skip
+        results = content["results"]
         if is_done(start, options, results):
             yield f"{start.name}: is there already"
             continue
@@ -113,7 +123,7 @@ def hold(all_starts: Sequence[Start], options: Options) -> Iterator[str]:
         except PeerError as error:
             yield f"{start.name}: failed: {error}"
             continue
-        content = {"machine": machine(), "results": [*results, result]}
+        content = {"machine": machine(), "terms": shared, "results": [*results, result]}
         options.file.parent.mkdir(parents=True, exist_ok=True)
         write_text(options.file, json.dumps(content, indent=1) + "\n")
         yield f"{start.name}: {_line(result)}"

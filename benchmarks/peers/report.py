@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -181,8 +181,9 @@ def document(content: dict[str, Any], trials: Sequence[Result]) -> str:
         lines += [f"## The {environment} environment", "", f"{budget} s each. {goal(all_groups, environment)}", ""]
         lines += [*table(all_groups, environment), ""]
     lines += ["![Completed flights over time](peers.png)", "", "*Median over the seeds; the shade is from least to "
-              "greatest.*", "", CAUSES, "## Who took part", "", *_parties(all_groups), "", SETTINGS]  # fmt: skip
-    lines += ["## What was tried", "", TRIALS, *_trials(trials), "", "## Where and with what", ""]
+              "greatest.*", "", CAUSES, "## Who took part", "", *_parties(all_groups), ""]  # fmt: skip
+    lines += [_settings(content["terms"]), "## What was tried", "", TRIALS, *_trials(trials)]
+    lines += ["", "## Where and with what", ""]
     return "\n".join([*lines, *_circumstances(content)]) + "\n"
 
 
@@ -214,6 +215,12 @@ def _parties(all_groups: Sequence[Group]) -> list[str]:
         noted = ", ".join(f"{package} {version}" for package, version in versions.items())
         lines.append(f"| {entry.label} | {entry.what} | {noted} |")
     return lines
+
+
+def _settings(shared: Mapping[str, Any]) -> str:
+    learner, replay = shared["learner"], shared["replay"]
+    steps = learner["batch_size"] / replay["samples_per_insert"]
+    return SETTINGS.format(learner=learner, replay=replay, steps=steps)
 
 
 def _trials(trials: Sequence[Result]) -> list[str]:

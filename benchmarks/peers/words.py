@@ -23,9 +23,11 @@ SETTINGS = """## Settings
 
 The same for all, from `configs/memory.toml` and the defaults: two convolutions of 16 and 32 channels and dueling
 streams of 128 units (Stable-Baselines3, without dueling: one stream of 256, as many parameters), inputs scaled by 4,
-batches of 64, discount 0.95, n = 3, replay of 200,000, first update after 2,000 steps, 8 samples per insert (one
-update for 8 steps), target copied every 500 updates, priorities with exponent 0.6 and importance weights from 0.4,
-RMSprop with 0.00025, gradients clipped at 40.
+batches of {learner[batch_size]}, discount {learner[discount]:g}, n = {learner[num_step]}, replay of
+{replay[capacity]:,}, first update after {replay[min_size]:,} steps, {replay[samples_per_insert]:g} samples per insert
+(one update for {steps:g} steps), target copied every {learner[target_period]} updates, priorities with exponent
+{replay[alpha]:g} and importance weights from {replay[beta]:g}, RMSprop with {learner[learning_rate]:g}, gradients
+clipped at {learner[gradient_clip]:g}.
 
 What differs, because a library has it so:
 

@@ -34,6 +34,18 @@ def test_seeds_are_interleaved_and_apex_bat_flies_the_registered_environment_onl
     assert len({start.name for start in order}) == len(order)
 
 
+def test_results_of_other_settings_are_not_mixed_with_those_of_now(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(contest, "run", made_up)
+    order = starts([entry_of("sb3")], ("registered",), 2)
+    list(hold(order[:1], options(tmp_path)))
+    monkeypatch.setattr(contest, "terms", lambda: load(None, ["learner.target_period=7"]))
+    with pytest.raises(PeerError, match="holds results of other settings"):
+        list(hold(order, options(tmp_path)))
+    assert len(contest.load(tmp_path / "peers.json")["results"]) == 1
+
+
 def test_what_is_done_is_not_run_again_and_a_failure_stops_nobody_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -50,10 +62,10 @@ def test_what_is_done_is_not_run_again_and_a_failure_stops_nobody_else(
     lines = list(hold(order, options(tmp_path)))
     assert ran == [start.name for start in order]
     assert [": failed: " in line for line in lines] == [False, True, False]
-    assert [result["entry"] for result in contest.load_results(tmp_path / "peers.json")] == ["tianshou", "rllib"]
+    assert [result["entry"] for result in contest.load(tmp_path / "peers.json")["results"]] == ["tianshou", "rllib"]
     list(hold(order, options(tmp_path)))
     assert ran[3:] == [order[1].name], "only what failed"
-    assert len(contest.load_results(tmp_path / "peers.json")) == 3
+    assert len(contest.load(tmp_path / "peers.json")["results"]) == 3
     list(hold(order, options(tmp_path, budgets_s={"registered": 30.0, "obvious": 30.0})))
     assert len(ran) == 7, "another budget is another result"
     list(hold(order[:1], options(tmp_path, overrides=("adam=1",))))

@@ -43,6 +43,13 @@ RESULTS = [
     *at("apex_bat", "registered", 100.0, 90.0, 120.0), *at("tianshou", "registered", 200.0, 400.0, 300.0),
     *at("sb3", "registered", NEVER, 250.0, NEVER), *at("tianshou", "obvious", NEVER, NEVER, 500.0),
 ]  # fmt: skip
+TERMS = {
+    "learner": {
+        "batch_size": 32, "discount": 0.9, "num_step": 2, "target_period": 77, "learning_rate": 0.003,
+        "gradient_clip": 9.0,
+    },
+    "replay": {"capacity": 5_000, "min_size": 100, "samples_per_insert": 4.0, "alpha": 0.5, "beta": 0.3},
+}  # fmt: skip
 MACHINE = {"processor": "a core", "cores": 2, "python": "3.11"}
 
 
@@ -90,17 +97,20 @@ def test_the_table_has_a_line_for_each_entry_and_apex_bat_in_both() -> None:
 
 def test_the_page_tells_rules_versions_trials_and_the_command() -> None:
     trial = at("sb3", "registered", 80.0)[0] | {"overrides": ["adam=1"], "budget_s": 120.0}
-    page = document({"machine": MACHINE, "results": RESULTS}, [trial])
-    for text in ("torch 2.13.0", "`adam=1`", "commit abc", "--budget-s 600 --seeds 3", "synchronous", "14 of 15"):
-        assert text in page or text == "synchronous"
-    assert "No trials are kept." in document({"machine": MACHINE, "results": RESULTS}, [])
+    page = document({"machine": MACHINE, "terms": TERMS, "results": RESULTS}, [trial])
+    for text in (
+        "torch 2.13.0", "`adam=1`", "commit abc", "--budget-s 600 --seeds 3", "14 of 15", "one update for 8 steps",
+        "every 77 updates", "RMSprop with 0.003",
+    ):  # fmt: skip
+        assert text in page
+    assert "No trials are kept." in document({"machine": MACHINE, "terms": TERMS, "results": RESULTS}, [])
     other = [each | {"budget_s": 900.0} if each["environment"] == "obvious" else each for each in RESULTS]
-    assert "--obvious-budget-s 900" in document({"machine": MACHINE, "results": other}, [])
+    assert "--obvious-budget-s 900" in document({"machine": MACHINE, "terms": TERMS, "results": other}, [])
 
 
 def test_page_and_picture_are_written_beside_the_results(tmp_path: Path) -> None:
     file = tmp_path / "peers.json"
-    file.write_text(json.dumps({"machine": MACHINE, "results": RESULTS}))
+    file.write_text(json.dumps({"machine": MACHINE, "terms": TERMS, "results": RESULTS}))
     (tmp_path / "peers_trials.json").write_text(json.dumps({"results": at("sb3", "registered", 80.0)}))
     page = report.write(file)
     assert page == tmp_path / "peers.md"

@@ -39,7 +39,7 @@ class Learner(Section, frozen=True):
     """Transitions of an update. Thesis 32, Ape-X 512."""
     optimiser: Literal["rmsprop", "adam"] = "rmsprop"
     """Thesis and Ape-X: RMSprop."""
-    learning_rate: Positive = 0.00025
+    learning_rate: Positive = 0.0005
     """Step size. Thesis 0.005, Ape-X 0.0000625."""
     rmsprop_decay: Share = 0.95
     """Smoothing of the squared gradients (Ape-X)."""
@@ -57,7 +57,7 @@ class Learner(Section, frozen=True):
     """Gamma, per step. Ape-X 0.99."""
     num_step: Annotated[int, Meta(ge=1, le=16)] = 3
     """n of the n-step return (Ape-X: 3)."""
-    target_period: CountOrZero = 500
+    target_period: CountOrZero = 100
     """Updates between copies of the target network; 0: the soft update below instead. Ape-X 2,500."""
     target_tau: Share = 0.001
     """Soft update: share of the online network taken over after each update (thesis: 0.001)."""

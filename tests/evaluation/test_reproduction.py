@@ -101,7 +101,7 @@ def test_a_folder_holds_one_campaign(tmp_path: Path) -> None:
         begin(folder, plan(folder, Config(), CONDITIONS, 1, 200))
     with pytest.raises(ConfigError, match="other settings"):
         begin(folder, plan(folder, load(None, ["learner.learning_rate=0.1"]), CONDITIONS, 1, 100))
-    with pytest.raises(ConfigError, match=r"learner.learning_rate: 0.00025 \| 0.1"):
+    with pytest.raises(ConfigError, match=r"learner.learning_rate: 0.0005 \| 0.1"):
         begin(folder, plan(folder, load(None, ["learner.learning_rate=0.1"]), CONDITIONS, 1, 100))
     # what does not change the experiment may change, and a first seed may be another
     begin(folder, plan(folder, load(None, ["seed=3", "recording.curves=false", "train.threads=2"]), CONDITIONS, 1, 100))

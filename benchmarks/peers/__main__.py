@@ -32,7 +32,7 @@ def main() -> int:
     parser.add_argument("--budget-s", type=float, default=600.0, help="wall-clock time of a training, from its start")
     parser.add_argument("--obvious-budget-s", type=float, help="the same in the obvious environment [as --budget-s]")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--every-s", type=float, default=10.0, help="time between policies that may be judged")
+    parser.add_argument("--every-s", type=float, default=5.0, help="time between policies that may be judged")
     parser.add_argument("--only", help="names of entries, separated by commas; also those of ablations")
     parser.add_argument("--environments", default=",".join(ENVIRONMENTS))
     parser.add_argument("--json", type=Path, default=Path("docs/results/peers.json"), dest="file")

@@ -171,7 +171,7 @@ def document(content: dict[str, Any], trials: Sequence[Result]) -> str:
     """
     results: list[Result] = content["results"]
     all_groups = groups(results)
-    lines = [HEAD, ""]
+    lines = [HEAD.format(every_s=_every(results)), ""]
     for environment in ENVIRONMENTS:
         budgets_s = sorted({group.budget_s for group in all_groups if group.environment == environment})
         if not budgets_s:
@@ -261,11 +261,16 @@ def _circumstances(content: dict[str, Any]) -> list[str]:
     ]
 
 
+def _every(results: Sequence[Result]) -> str:
+    return " or ".join(f"{every_s:g}" for every_s in sorted({float(result["every_s"]) for result in results}))
+
+
 def _command(results: Sequence[Result]) -> str:
     seeds = 1 + max(int(result["seed"]) for result in results)
     budgets = {str(result["environment"]): float(result["budget_s"]) for result in results}
-    registered = budgets.get("registered", 0.0)
-    text = f"python -m benchmarks.peers --budget-s {registered:g} --seeds {seeds} --json docs/results/peers.json"
+    registered, every_s = budgets.get("registered", 0.0), float(results[0]["every_s"])
+    text = f"python -m benchmarks.peers --budget-s {registered:g} --seeds {seeds} --every-s {every_s:g}"
+    text += " --json docs/results/peers.json"
     obvious = budgets.get("obvious", registered)
     return text if obvious == registered else f"{text} --obvious-budget-s {obvious:g}"
 

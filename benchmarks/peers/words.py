@@ -2,13 +2,13 @@
 
 HEAD = """# apex_bat beside other libraries
 
-Made by `python -m benchmarks.peers` from measurements in one run on one machine, nothing else running, seeds
-interleaved: first every entry with seed 0, then every one with seed 1, and so on. The same bat learns to fly through
-the same arena, simple, in the condition memory, with the same network, settings and cores.
+Made by `python -m benchmarks.peers` from measurements on one machine, nothing else running, seeds interleaved: first
+every entry with seed 0, then every one with seed 1, and so on; interrupted, the command goes on. The same bat learns
+to fly through the same arena, simple, in the condition memory, with the same network, settings and cores.
 
 - *The clock* begins with the command and counts everything: imports, start of workers, training. Policies are written
-  every 10 s and judged afterwards by one function for all, so judging costs nobody time. apex_bat runs as it ships:
-  its own evaluator, recordings and snapshots run beside its training and cost it time and memory.
+  every {every_s} s and judged afterwards by one function for all, so judging costs nobody time. apex_bat runs as it
+  ships: its own evaluator, recordings and snapshots run beside its training and cost it time and memory.
 - *Judged* are the 15 flights of `apex-bat evaluate`: fixed starts, no exploration, 1000 steps. Every policy is judged
   until one completes 14; that one's time is the result. After it one a minute is judged, and the last. Progress is the
   mean net way of its flights along the corridor, of at most some 165 m: a bat that circles on the spot completes

@@ -99,8 +99,8 @@ def test_the_page_tells_rules_versions_trials_and_the_command() -> None:
     trial = at("sb3", "registered", 80.0)[0] | {"overrides": ["adam=1"], "budget_s": 120.0}
     page = document({"machine": MACHINE, "terms": TERMS, "results": RESULTS}, [trial])
     for text in (
-        "torch 2.13.0", "`adam=1`", "commit abc", "--budget-s 600 --seeds 3", "14 of 15", "one update for 8 steps",
-        "every 77 updates", "RMSprop with 0.003",
+        "torch 2.13.0", "`adam=1`", "commit abc", "--budget-s 600 --seeds 3 --every-s 10", "14 of 15", "every 10 s",
+        "one update for 8 steps", "every 77 updates", "RMSprop with 0.003",
     ):  # fmt: skip
         assert text in page
     assert "No trials are kept." in document({"machine": MACHINE, "terms": TERMS, "results": RESULTS}, [])

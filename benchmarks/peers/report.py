@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import statistics
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -182,7 +183,7 @@ def document(content: dict[str, Any], trials: Sequence[Result]) -> str:
         lines += [*table(all_groups, environment), ""]
     lines += ["![Completed flights over time](peers.png)", "", "*Median over the seeds; the shade is from least to "
               "greatest.*", "", CAUSES, "## Who took part", "", *_parties(all_groups), ""]  # fmt: skip
-    lines += [_settings(content["terms"]), "## What was tried", "", TRIALS, *_trials(trials)]
+    lines += [_settings(content["terms"]), "## What was tried", "", *_trials(trials)]
     lines += ["", "## Where and with what", ""]
     return "\n".join([*lines, *_circumstances(content)]) + "\n"
 
@@ -220,13 +221,15 @@ def _parties(all_groups: Sequence[Group]) -> list[str]:
 def _settings(shared: Mapping[str, Any]) -> str:
     learner, replay = shared["learner"], shared["replay"]
     steps = learner["batch_size"] / replay["samples_per_insert"]
-    return SETTINGS.format(learner=learner, replay=replay, steps=steps)
+    title, sentence, *rest = SETTINGS.format(learner=learner, replay=replay, steps=steps).split("\n\n")
+    return "\n\n".join([title, textwrap.fill(sentence, 118, break_long_words=False, break_on_hyphens=False), *rest])
 
 
 def _trials(trials: Sequence[Result]) -> list[str]:
     if not trials:
         return ["No trials are kept."]
     lines = [
+        TRIALS,
         f"| | environment | settings | seed | s | steps | s to {ENOUGH} of 15 | steps to it | most completed "
         "| steps/s | updates/s |",
         "|---|---|---|--:|--:|--:|--:|--:|--:|--:|--:|",

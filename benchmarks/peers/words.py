@@ -45,17 +45,21 @@ What differs, because a library has it so:
 
 CAUSES = """## Where the time goes
 
-apex_bat and Stable-Baselines3 make about as many steps and updates a second: on two cores an update is the limit of
-both. apex_bat's learner fills one core with them; actor, replay server, evaluator and launcher need about half of
-the other. What it gains is that it needs fewer steps and updates: priorities, an epsilon for each bat, half of each
-batch mirrored, the average of the network judged. Tianshou and RLlib need more steps than apex_bat, too, and make
-less than half as many a second, with the same network and environment; what they spend the rest on was not
-profiled.
+On two cores an update is the limit of apex_bat and of Stable-Baselines3, and they make about as many a second, with as
+many steps. apex_bat's learner fills one core with them; actor, replay server, evaluator and launcher need about half of
+the other. What it gains is that it needs fewer: it is good after 700 to 800 updates, Stable-Baselines3 after 1,700 to
+2,000. Priorities, an epsilon for each bat, half of each batch mirrored and the average of the network make the
+difference; their shares were not taken apart. Tianshou and RLlib make less than half as many updates a second with the
+same network and environment; what they spend the rest on was not profiled. RLlib's 30 s with seed 0 are the luck of one
+policy after 240 updates: a minute later it completed no flight.
 
-So the goal in the registered environment is missed for want of updates. Tried for faster ones, each beside what is
-there on the same machine, and without a gain that stood out of its noise: gradients by hand instead of by autograd,
-all parameters in one tensor for the optimiser, an allocator that keeps its memory. A search over actors, bats,
-samples per insert, batch and learning rate ([tune.md](tune.md)) found one actor better than two, and nothing else.
+So the goal in the registered environment is missed for want of updates. Of apex_bat's 19 s some 7 are over before the
+first update, with imports and 2,000 steps of flight; a third of the best peer's time would leave it some 300 updates.
+Tried for faster ones, each beside what is there on the same machine, and without a gain that stood out of its noise:
+gradients by hand instead of by autograd, all parameters in one tensor for the optimiser, an allocator that keeps its
+memory. Tried for fewer: [a search](tune.md). It found a learning rate and a period of the target network with which
+apex_bat needs less than half the time; but the peers share these settings, and gain as much. With the former ones
+(commit dda65f8, two seeds) apex_bat took 45 s, Stable-Baselines3 85, Tianshou 200 and RLlib 211.
 """
 
 TRIALS = """Short trainings by which the peers' settings were chosen. They ran beside other work: times and rates are

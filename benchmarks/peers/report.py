@@ -31,6 +31,7 @@ class Reached(NamedTuple):
 
     wall_s: float
     env_steps: float
+    updates: float
     cpu_s: float
     progress_m: float
     """Mean net way of its flights."""
@@ -68,10 +69,8 @@ def reached(result: Result) -> Reached:
     """Returns when a training first completed enough flights."""
     for point in judged(result):
         if point["completed"] >= ENOUGH:
-            return Reached(
-                float(point["wall_s"]), float(point["env_steps"]), float(point["cpu_s"]), float(point["progress_m"])
-            )
-    return Reached(NEVER, NEVER, NEVER, NEVER)
+            return Reached(*(float(point[name]) for name in Reached._fields))
+    return Reached(*(NEVER for _ in Reached._fields))
 
 
 def groups(results: Sequence[Result]) -> list[Group]:
@@ -135,9 +134,9 @@ def goal(all_groups: Sequence[Group], environment: Environment) -> str:
 def table(all_groups: Sequence[Group], environment: Environment) -> list[str]:
     """Returns the table of an environment; apex_bat stands in each, though it only flies the registered one."""
     lines = [
-        f"| | seeds | s to the first step | s to {ENOUGH} of 15 | steps to it | CPU s to it | its progress in m "
-        "| completed at the end | steps/s | updates/s | memory MB |",
-        "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
+        f"| | seeds | s to the first step | s to {ENOUGH} of 15 | steps to it | updates to it | CPU s to it "
+        "| its progress in m | completed at the end | steps/s | updates/s | memory MB |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for group in all_groups:
         if group.environment != environment and group.entry != OURS:
@@ -146,7 +145,7 @@ def table(all_groups: Sequence[Group], environment: Environment) -> list[str]:
             group.label + (" (registered environment)" if group.environment != environment else ""),
             str(len(group.results)),
             spread([float(result["start_s"]) for result in group.results]),
-            *(spread([each[field] for each in group.reached]) for field in range(4)),
+            *(spread([each[field] for each in group.reached]) for field in range(len(Reached._fields))),
             spread([float(judged(result)[-1]["completed"]) for result in group.results]),
             *(spread([float(result[name]) for result in group.results], digits) for name, digits in _RATES),
         ]

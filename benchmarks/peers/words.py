@@ -46,12 +46,12 @@ What differs, because a library has it so:
 CAUSES = """## Where the time goes
 
 On two cores an update is the limit of apex_bat and of Stable-Baselines3, and they make about as many a second, with as
-many steps. apex_bat's learner fills one core with them; actor, replay server, evaluator and launcher need about half of
-the other. What it gains is that it needs fewer: it is good after 700 to 800 updates, Stable-Baselines3 after 1,700 to
-2,000. Priorities, an epsilon for each bat, half of each batch mirrored and the average of the network make the
-difference; their shares were not taken apart. Tianshou and RLlib make less than half as many updates a second with the
-same network and environment; what they spend the rest on was not profiled. RLlib's 30 s with seed 0 are the luck of one
-policy after 240 updates: a minute later it completed no flight.
+many steps. apex_bat's learner fills one core with them; actor, replay server, evaluator and launcher need about half
+of the other. What it gains is that it needs fewer than half of Stable-Baselines3's updates. Priorities, an epsilon for
+each bat, half of each batch mirrored and the average of the network make the difference; their shares were not taken
+apart. Tianshou and RLlib make less than half as many updates a second with the same network and environment; what they
+spend the rest on was not profiled. RLlib's 30 s with seed 0 are the luck of one policy after 240 updates: a minute
+later it completed no flight.
 
 So the goal in the registered environment is missed for want of updates. Of apex_bat's 19 s some 7 are over before the
 first update, with imports and 2,000 steps of flight; a third of the best peer's time would leave it some 300 updates.

@@ -23,7 +23,7 @@ def result(entry: str, environment: str, seed: int, curve: list[tuple[float, int
         "updates_per_s": 50.0, "memory_mb": 800.0,
         "curve": [
             {
-                "wall_s": s, "env_steps": int(100 * s), "updates": 1, "cpu_s": 2 * s, "completed": completed,
+                "wall_s": s, "env_steps": int(100 * s), "updates": int(10 * s), "cpu_s": 2 * s, "completed": completed,
                 "progress_m": 150.0,
             }
             for s, completed in curve
@@ -55,8 +55,8 @@ MACHINE = {"processor": "a core", "cores": 2, "python": "3.11"}
 
 def test_a_training_has_reached_it_at_the_first_policy_that_completes_enough() -> None:
     made = result("sb3", "registered", 0, [(10.0, 3), (20.0, None), (30.0, 14), (40.0, 15)])
-    assert reached(made) == (30.0, 3000.0, 60.0, 150.0)
-    assert reached(result("sb3", "registered", 0, [(10.0, 13)])) == (NEVER, NEVER, NEVER, NEVER)
+    assert reached(made) == (30.0, 3000.0, 300.0, 60.0, 150.0)
+    assert reached(result("sb3", "registered", 0, [(10.0, 13)])) == (NEVER,) * 5
 
 
 def test_a_median_of_seeds_most_of_which_never_got_there_is_never() -> None:
@@ -91,7 +91,8 @@ def test_without_apex_bat_nothing_is_compared_and_without_success_it_has_missed(
 def test_the_table_has_a_line_for_each_entry_and_apex_bat_in_both() -> None:
     lines = table(groups(RESULTS), "obvious")[2:]
     assert [line.split(" | ")[0] for line in lines] == ["| apex_bat (registered environment)", "| Tianshou"]
-    assert "| never (500, never) | never (50,000, never) | never (1,000, never) | never (150, never) |" in lines[1]
+    times = ("never (500, never)", "never (50,000, never)", "never (5,000, never)", "never (1,000, never)")
+    assert f"| {' | '.join(times)} | never (150, never) |" in lines[1]
     assert "| 5 (5, 12) |" in lines[1]
 
 
@@ -102,7 +103,7 @@ def test_the_page_tells_rules_versions_trials_and_the_command() -> None:
         "torch 2.13.0", "`adam=1`", "commit abc", "--budget-s 600 --seeds 3 --every-s 10", "14 of 15", "every 10 s",
         "one update for 8 steps", "every 77 updates", "RMSprop with 0.003",
     ):  # fmt: skip
-        assert text in page
+        assert text in " ".join(page.split())
     assert "No trials are kept." in document({"machine": MACHINE, "terms": TERMS, "results": RESULTS}, [])
     other = [each | {"budget_s": 900.0} if each["environment"] == "obvious" else each for each in RESULTS]
     assert "--obvious-budget-s 900" in document({"machine": MACHINE, "terms": TERMS, "results": other}, [])

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +28,8 @@ from apex_bat.agent.inference import (
 from apex_bat.agent.losses import double_q_target, td_errors, weighted_loss
 from apex_bat.agent.mirror import mirror_batch
 from apex_bat.agent.network import DuelingNetwork, Values, load_parameters, parameters_of
-from apex_bat.config import Config, settings
+from apex_bat.agent.optimiser import Optimiser
+from apex_bat.config import Config
 from apex_bat.experience import Batch
 
 AVERAGED_SHARE = 0.1  # of the updates so far, at most: what was learnt first does not burden the average for long
@@ -61,18 +61,11 @@ class D3QN:
         self.target.load_state_dict(self.online.state_dict())
         self.target.requires_grad_(False).eval()  # dropout is for learning: no noise in targets
         self.average = deepcopy(self.target) if config.learner.averaged_updates else None
+        self.optimiser = Optimiser(list(self.online.parameters()), config.learner)
         self.num_updates = 0
         self._values: tuple[Callable[..., Values], Callable[..., Values]] = (self.online, self.target)
         if config.learner.compile:
             self._values = (torch.compile(self.online), torch.compile(self.target))
-
-    @cached_property
-    def optimiser(self) -> torch.optim.Optimizer:
-        """The optimiser, made when it is first needed: for it torch imports its compiler, in 2 s of CPU (measured).
-
-        So a new learner broadcasts its weights before, and actors that wait for them fly so much earlier.
-        """
-        return _optimiser(self.online, self._settings)
 
     def update(self, batch: Batch) -> Update:
         """Takes one step of gradient descent on a batch and copies the target network when its time has come."""
@@ -92,7 +85,7 @@ class D3QN:
             q = online(*states).q.float()
         errors = td_errors(q, actions, double_q_target(rewards, discounts, next_q_online, next_q_target))
         loss = weighted_loss(errors, weights, self._settings.loss)
-        self.optimiser.zero_grad(set_to_none=True)
+        self.online.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         limit = self._settings.gradient_clip if self._settings.gradient_clip > 0.0 else float("inf")
         norm = torch.nn.utils.clip_grad_norm_(self.online.parameters(), limit)
@@ -111,10 +104,7 @@ class D3QN:
         arrays: dict[str, NDArray[Any]] = {}
         for prefix, network in self._networks().items():
             arrays |= {prefix + name: array for name, array in parameters_of(network).items()}
-        for number, state in self.optimiser.state_dict()["state"].items():
-            for key, value in state.items():
-                arrays[f"optimiser/{number}/{key}"] = torch.as_tensor(value).cpu().numpy().copy()
-        return arrays
+        return arrays | self.optimiser.arrays()
 
     def restore(self, arrays: dict[str, NDArray[Any]], num_updates: int) -> None:
         """Continues from what `arrays` returned; an average that they lack begins anew from the online network.
@@ -125,15 +115,8 @@ class D3QN:
         for prefix, network in self._networks().items():
             given = policy_parameters(arrays) if prefix == AVERAGE else parameters_under(prefix, arrays)
             load_parameters(network, given)
-        state: dict[int, dict[str, torch.Tensor]] = {}
-        for name, array in arrays.items():
-            if name.startswith("optimiser/"):
-                _, number, key = name.split("/")
-                state.setdefault(int(number), {})[key] = torch.from_numpy(np.array(array))
-        groups = self.optimiser.state_dict()["param_groups"]
-        if num_updates and set(state) != {number for group in groups for number in group["params"]}:
-            raise ValueError("the checkpoint's optimiser state does not fit this network")
-        self.optimiser.load_state_dict({"state": state, "param_groups": groups})
+        if num_updates:  # before the first, all moments are zero, and older checkpoints hold none
+            self.optimiser.restore(arrays)
         self.num_updates = num_updates
 
     def _moved(self, array: NDArray[Any]) -> Tensor:
@@ -167,19 +150,3 @@ def _approach(slow: DuelingNetwork, fast: DuelingNetwork, share: float) -> None:
     with torch.no_grad():
         for moved, goal in zip(slow.parameters(), fast.parameters(), strict=True):
             moved.lerp_(goal, share)
-
-
-def import_compiler() -> None:
-    """Makes torch import what it imports when the first optimiser is made, see `D3QN.optimiser`."""
-    torch.optim.RMSprop([torch.nn.Parameter(torch.zeros(1))])
-
-
-def _optimiser(network: DuelingNetwork, learner: settings.Learner) -> torch.optim.Optimizer:
-    if learner.optimiser == "adam":
-        return torch.optim.Adam(
-            network.parameters(), learner.learning_rate, eps=learner.epsilon, weight_decay=learner.weight_decay
-        )
-    return torch.optim.RMSprop(
-        network.parameters(), learner.learning_rate, alpha=learner.rmsprop_decay, eps=learner.epsilon,
-        weight_decay=learner.weight_decay, centered=learner.rmsprop_centred,
-    )  # fmt: skip

@@ -170,7 +170,7 @@ def threads_of(role: Role, config: Config) -> int:
 
 
 def has_reserve(role: Role, config: Config) -> bool:
-    """Whether a process waits to take the place of a role: of the learner, which imports torch and its compiler."""
+    """Whether a process waits to take the place of a role: of the learner, which imports torch."""
     return role.kind == "learner" and config.launch.learner_in_reserve
 
 

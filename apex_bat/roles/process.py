@@ -63,7 +63,7 @@ def run_process(
     logging.basicConfig(level=logging.INFO, format=_line_format(role))
     if in_reserve:
         _be_continued_when_orphaned()
-        _prepare(kind)
+        _entry_of(kind)
         try:
             life = await_life()
         except TransportError as error:
@@ -163,17 +163,8 @@ def _line_format(role: Role) -> str:
     return f"%(asctime)s {role.name} %(levelname)s %(message)s"
 
 
-def _prepare(kind: Kind) -> None:
-    """Imports what a role will need."""
-    _entry_of(kind)
-    if kind == "learner":
-        from apex_bat.agent.d3qn import import_compiler
-
-        import_compiler()
-
-
 def _entry_of(kind: Kind) -> Callable[[Assignment], None]:
-    """Returns what runs a role; each kind imports only what it needs."""
+    """Imports and returns what runs a role; each kind imports only what it needs."""
     if kind == "actor":
         from apex_bat.roles.actor import run_actor as run
     elif kind == "replay":

@@ -25,13 +25,14 @@ BEGINS = 3
 
 def measure() -> list[Record]:
     """Returns the records that `apex-bat bench system` writes; a run is the rows of its reports, a second each."""
-    begins = [_seconds_until_flight() for _ in range(BEGINS)]
-    records = [summary("system.first_step_s", "s", begins)]
+    begins = [_seconds_to_begin() for _ in range(BEGINS)]
+    flown_s, learnt_s = ([begin[i] for begin in begins] for i in range(2))
+    records = [summary("system.first_step_s", "s", flown_s), summary("system.first_update_s", "s", learnt_s)]
     return records + [record for num_actors in NUM_ACTORS for record in _measure(num_actors)]
 
 
-def _seconds_until_flight() -> float:
-    """Returns the time from the command to the first environment step of a run with the defaults."""
+def _seconds_to_begin() -> tuple[float, float]:
+    """Returns the times from the command to first environment step and first update of a run with the defaults."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         begun_s = time.perf_counter()
@@ -39,13 +40,20 @@ def _seconds_until_flight() -> float:
             [sys.executable, "-m", "apex_bat", "train", "--plain", "--run", str(run)], stdout=subprocess.DEVNULL
         ) as launcher:
             try:
-                while not any("begins to fly" in log.read_text() for log in (run / "logs").glob("actor-*.log")):
-                    if launcher.poll() is not None:
-                        raise RuntimeError(f"the run ended with exit code {launcher.returncode} before it flew")
-                    time.sleep(0.05)
-                return time.perf_counter() - begun_s
+                marks = (("actor-*.log", "begins to fly"), ("learner.log", "begins to learn"))
+                flown_s, learnt_s = (_wait_for(run / "logs", logs, line, launcher) for logs, line in marks)
+                return flown_s - begun_s, learnt_s - begun_s
             finally:
                 launcher.terminate()
+
+
+def _wait_for(folder: Path, logs: str, line: str, launcher: subprocess.Popen[bytes]) -> float:
+    """Returns when a line stands in one of the logs, by `time.perf_counter`."""
+    while not any(line in log.read_text(encoding="utf-8") for log in folder.glob(logs)):
+        if launcher.poll() is not None:
+            raise RuntimeError(f"the run ended with exit code {launcher.returncode} before a role {line}")
+        time.sleep(0.05)
+    return time.perf_counter()
 
 
 def _measure(num_actors: int) -> list[Record]:

@@ -81,7 +81,8 @@ class Recording(Section, frozen=True):
     sampled_flights: CountOrZero = 1
     """Flights recorded of each evaluation during training."""
     every_episodes: CountOrZero = 20
-    """The actors below record every n-th episode of their least exploring bat; 0: none."""
+    """The actors below record every n-th episode of their least exploring bat, the first
+    one being the n-th; 0: none."""
     actors: tuple[CountOrZero, ...] = (0,)
     """Numbers of the actors that record."""
     heavy_period_steps: Count = 5
@@ -102,7 +103,7 @@ class Launch(Section, frozen=True):
     quick_failure_s: Positive = 20.0
     """A failure is quick when the role lived shorter than this. It works after 3 to 8 s (measured on two cores)."""
     learner_in_reserve: bool = True
-    """Whether a process that has imported torch waits to take the place of a learner that dies. It takes 320 MB."""
+    """Whether a process that has imported torch waits to take the place of a learner that dies. It takes 250 MB."""
     start_timeout_s: Positive = 120.0
     """A new process that has not been heard of for this long is killed and replaced; importing torch takes seconds."""
     heartbeat_timeout_s: Positive = 30.0

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 GROWTH_PERIOD_S = 1.0
 MANY_ROWS = 1000
-"""Rows of roles that do not come to fly, after which these are written all the same."""
+"""Rows of a run that does not get under way, after which these are written all the same."""
 _log = logging.getLogger(__name__)
 
 Start = Callable[[Role, int, int], Handle]
@@ -42,6 +42,16 @@ class Ended(NamedTuple):
     learner_steps: int
     elapsed_s: float
     """Time in which it flew, in all parts of the run."""
+
+
+class _Row(NamedTuple):
+    """A report with the moment at which it came."""
+
+    report: Report
+    elapsed_s: float
+    env_steps: float
+    learner_step: float
+    unix_s: float
 
 
 class Course:
@@ -75,7 +85,7 @@ class Course:
         self._supervisor = Supervisor(roles_of(config), self._start, config.launch)
         self._standing = Standing(config, time.monotonic(), origin)
         self._metrics: MetricsWriter | None = None
-        self._early_rows: list[Report] = []
+        self._early_rows: list[_Row] = []
         self._thinner = RowThinner(config.launch.dense_rows_s)
         self._status, self._lost_writes = StatusFile(run), LostWrites()
         self._status_due_s = self._growth_due_s = 0.0
@@ -162,19 +172,19 @@ class Course:
             self._standing.look(self._supervisor.watched)
             self._write_status(has_ended=False)
 
-    def _append(self, row: Report) -> None:
-        """Writes a row; those before the first environment step wait for it.
+    def _append(self, report: Report) -> None:
+        """Writes a report as a row; those of the start wait until the run is under way.
 
-        What writes them takes 2 s to import, which on few cores would come out of the time until the bats fly.
+        What writes them takes 2 s to import, which on few cores would come out of the time until it learns.
         """
         standing = self._standing
-        if self._metrics is None:
-            self._early_rows.append(row)
-            if standing.flying_since_s is not None or len(self._early_rows) >= MANY_ROWS:
-                self._write_early_rows()
+        row = _Row(report, standing.elapsed_s, standing.env_steps, standing.learner_step, time.time())
+        if self._metrics is not None:
+            self._write(self._metrics, row)
             return
-        with self._lost_writes.borne():
-            self._metrics.append(row, standing.elapsed_s, standing.env_steps, standing.learner_step)
+        self._early_rows.append(row)
+        if standing.is_under_way or len(self._early_rows) >= MANY_ROWS:
+            self._write_early_rows()
 
     def _write_early_rows(self) -> None:
         from apex_bat.recording.metrics import MetricsWriter
@@ -184,7 +194,11 @@ class Course:
         self._metrics = MetricsWriter(self._run / "metrics", training)
         rows, self._early_rows = self._early_rows, []
         for row in rows:
-            self._append(row)
+            self._write(self._metrics, row)
+
+    def _write(self, metrics: MetricsWriter, row: _Row) -> None:
+        with self._lost_writes.borne():
+            metrics.append(*row)
 
     def _write_status(self, *, has_ended: bool) -> None:
         with self._lost_writes.borne():

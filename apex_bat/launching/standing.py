@@ -12,6 +12,7 @@ from apex_bat.roles.plan import Role, roles_of
 from apex_bat.transport.messages import Report
 
 _RECENT_REPORTS = 30
+_A_WHILE_S = 5.0
 
 
 class RoleStanding:
@@ -114,6 +115,13 @@ class Standing:
     def learner_step(self) -> float:
         """Updates of the network."""
         return self.roles["learner"].gauge("learner_step", self._origin.updates)
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether this part of the run has learnt something, or flown for a while: its start is over."""
+        if self.flying_since_s is None:
+            return False
+        return self.learner_step > self._origin.updates or self.now_s - self.flying_since_s > _A_WHILE_S
 
     def recent(self, name: str) -> float | None:
         """Returns the mean of `return` or `return_greedy` over the newest reports; None before the first."""

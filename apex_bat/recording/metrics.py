@@ -49,7 +49,9 @@ class MetricsWriter:
         self._events: EventsWriter | EventFile | None = None
         self._num_event_files = 0
 
-    def append(self, report: Report, elapsed_s: float, env_steps: float, learner_step: float) -> None:
+    def append(
+        self, report: Report, elapsed_s: float, env_steps: float, learner_step: float, unix_s: float | None = None
+    ) -> None:
         """Appends the report of a role with the counters of the whole run.
 
         Args:
@@ -57,12 +59,14 @@ class MetricsWriter:
             elapsed_s: time since the first environment step of the run.
             env_steps: environment steps of all bats.
             learner_step: updates of the learner.
+            unix_s: when the report came, by the writer's clock; None: now.
 
         Raises:
             StorageError: the disk is full.
         """
+        unix_s = self._clock() if unix_s is None else unix_s
         row = {
-            "unix_s": round(self._clock(), 3), "elapsed_s": round(elapsed_s, 3), "role": report.role, "pid": report.pid,
+            "unix_s": round(unix_s, 3), "elapsed_s": round(elapsed_s, 3), "role": report.role, "pid": report.pid,
             "env_steps_total": env_steps, "learner_step_total": learner_step, "state": report.state, **report.metrics,
         }  # fmt: skip
         if self._training is not None:
@@ -72,11 +76,11 @@ class MetricsWriter:
             if report.role not in self._files:
                 self._files[report.role] = path.open("a+b", buffering=0)
             _append_line(self._files[report.role], json.dumps(row))
-            self._append_events(report, env_steps)
+            self._append_events(report, env_steps, unix_s)
         except OSError as error:
             raise StorageError(f"{path}: cannot be written: {error.strerror or error}") from None
 
-    def _append_events(self, report: Report, env_steps: float) -> None:
+    def _append_events(self, report: Report, env_steps: float, unix_s: float) -> None:
         values = [Summary.Value(tag=f"{report.role}/{name}", simple_value=v) for name, v in report.metrics.items()]
         try:
             if self._events is None:
@@ -85,7 +89,7 @@ class MetricsWriter:
                 self._num_event_files += 1
                 suffix = "" if self._num_event_files == 1 else f".{self._num_event_files}"
                 self._events = self._open_events(str(self._folder / "tensorboard" / "events"), suffix)
-            self._events.write_event(Event(wall_time=self._clock(), step=int(env_steps), summary=Summary(value=values)))
+            self._events.write_event(Event(wall_time=unix_s, step=int(env_steps), summary=Summary(value=values)))
             self._events.flush()
         except OSError:  # its end may be torn, and what follows a torn event is not read: the next goes to a new file
             self._events = None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import threading
+from importlib import import_module
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from apex_bat.roles.plan import Assignment
 from apex_bat.simulation.arenas import arena_names
 from apex_bat.simulation.vector import EchoFlightVector, Info, Observation
 
+_WRITER = "apex_bat.recording.keeping"
 _log = logging.getLogger(__name__)
 
 
@@ -31,10 +34,15 @@ class EpisodeRecorder:
         """Number of the present episode of that bat."""
         self._log: FlightLog | None = None
         self._row: dict[str, object] = {}
+        self._is_prepared = False
 
     def begin(self, learner_step: int) -> None:
         """Starts to follow an episode if it is the turn of one."""
-        if self._every == 0 or self.episode % self._every:
+        if self._every == 0:
+            return
+        if learner_step > 0 and not self._is_prepared:
+            self._prepare()
+        if (self.episode + 1) % self._every:
             return
         config = self._assignment.config
         name = self._names[self._env.colony.arena_index[self.bat]]
@@ -72,11 +80,15 @@ class EpisodeRecorder:
         self.episode += 1
         if self._log is None:
             return
-        from apex_bat.recording.keeping import keep_flights
-
+        keep_flights = import_module(_WRITER).keep_flights
         flight = self._log.finish(self._env.poses[self.bat].copy(), str(info["end"][self.bat]))
         self._log = None
         try:
             keep_flights([flight], self._assignment.config, self._assignment.run, draw=False)
         except OSError as error:
             _log.error("no recording: %s", error)
+
+    def _prepare(self) -> None:
+        """Imports what writes recordings, 2 s of CPU, beside the flight and not before the learner has begun."""
+        self._is_prepared = True
+        threading.Thread(target=import_module, args=(_WRITER,), daemon=True).start()

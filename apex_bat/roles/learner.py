@@ -44,10 +44,13 @@ def run_learner(assignment: Assignment) -> None:
         )  # fmt: skip
         reporter = stack.enter_context(closing(RoleReporter(assignment, addresses.weights)))
         learner = Learner(assignment, agent, version, reader, publisher, reporter)
+        has_learnt = False
         while not (assignment.stop.is_set() or learner.is_done):
             if (moved := assignment.moved()) is not None:
                 reader.redirect(moved.replays, moved.replay_generations)
-            learner.step(_WAIT_S)
+            if learner.step(_WAIT_S) and not has_learnt:
+                has_learnt = True
+                _log.info("begins to learn")
             reporter.gauge("weights.subscribers", publisher.num_subscribers)
             for reason in PUBLISHER_REASONS:
                 reporter.gauge(f"weights.refused.{reason}", publisher.refusals.counts.get(reason, 0))

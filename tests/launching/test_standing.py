@@ -7,7 +7,7 @@ from rich.console import Console
 
 from apex_bat.config import Config, load
 from apex_bat.launching.live import PlainView, TerminalView, figures
-from apex_bat.launching.standing import Standing
+from apex_bat.launching.standing import Origin, Standing
 from apex_bat.launching.supervisor import Watched
 from apex_bat.roles.plan import Role, roles_of
 from apex_bat.transport.messages import Report
@@ -45,6 +45,28 @@ def test_time_runs_from_the_first_environment_step() -> None:
     assert not standing.is_over
     standing.now_s = 64.0
     assert standing.is_over
+
+
+def test_a_run_is_under_way_once_it_has_learnt_or_has_flown_for_a_while() -> None:
+    learnt, flown = standing_of(Config()), standing_of(Config())
+    for standing in (learnt, flown):
+        standing.take(report("learner", {"learner_step": 0}), 10.0)
+        assert not standing.is_under_way
+        standing.take(report("actor-0", {"env_steps": 5}), 10.0)
+        assert not standing.is_under_way
+    learnt.take(report("learner", {"learner_step": 1}), 10.0)
+    assert learnt.is_under_way
+    flown.now_s = 16.0
+    assert flown.is_under_way
+
+
+def test_a_resumed_run_is_under_way_once_it_learns_more() -> None:
+    standing = Standing(Config(), now_s=0.0, origin=Origin(updates=700.0))
+    standing.take(report("actor-0", {"env_steps": 5}), 1.0)
+    standing.take(report("learner", {"learner_step": 700}), 1.0)
+    assert not standing.is_under_way
+    standing.take(report("learner", {"learner_step": 701}), 1.0)
+    assert standing.is_under_way
 
 
 @pytest.mark.parametrize(

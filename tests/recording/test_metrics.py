@@ -24,6 +24,15 @@ def test_each_row_is_in_the_file_as_soon_as_it_is_appended(tmp_path: Path) -> No
     writer.close()
 
 
+def test_a_row_that_had_to_wait_carries_the_moment_of_its_report(tmp_path: Path) -> None:
+    writer = MetricsWriter(tmp_path, clock=lambda: 99.0)
+    writer.append(REPORT, elapsed_s=1.5, env_steps=10, learner_step=3, unix_s=95.0)
+    writer.append(REPORT, elapsed_s=5.5, env_steps=10, learner_step=3)
+    rows = [json.loads(line) for line in (tmp_path / "actor-0.jsonl").read_text().splitlines()]
+    assert [row["unix_s"] for row in rows] == [95.0, 99.0]
+    writer.close()
+
+
 def test_the_same_figures_are_tensorboard_events(tmp_path: Path) -> None:
     writer = MetricsWriter(tmp_path)
     writer.append(REPORT, elapsed_s=1.5, env_steps=10, learner_step=3)

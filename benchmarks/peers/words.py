@@ -75,6 +75,6 @@ gained, too: Stable-Baselines3 is good after some 1,200 updates, RLlib after few
 peer's time is 6 s, which is when apex_bat makes its first update: the goal would take a peer that needs five minutes.
 """
 
-TRIALS = """Short trainings with other settings of the peers, after the contest, on the same machine, one seed each. So few
-say little: as chosen, Stable-Baselines3 took 30 to 60 s in the two contests of three seeds.
+TRIALS = """Short trainings with other settings of the peers, after the contest, on the same machine, one seed each. So
+few say little: as chosen, Stable-Baselines3 took 30 to 60 s in the two contests of three seeds.
 """

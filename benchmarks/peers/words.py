@@ -48,11 +48,11 @@ CAUSES = """## Where the time goes
 
 **Registered.** On two cores an update is the limit of apex_bat and of Stable-Baselines3, and they make about as many a
 second, with as many steps. apex_bat's learner fills one core with them; actor, replay server, evaluator and launcher
-need about half of the other. What it gains is that it needs fewer than half of Stable-Baselines3's updates. Priorities,
-an epsilon for each bat, half of each batch mirrored and the average of the network make the difference; their shares
-were not taken apart. Tianshou and RLlib make less than half as many updates a second with the same network and
-environment; what they spend the rest on was not profiled. RLlib's policies come and go: one completes 14, and one a
-minute later completes few.
+need about half of the other. What it gains is that it needs fewer than half of Stable-Baselines3's updates. Half of
+each batch mirrored and the average of the network are the larger part of it: without both (apex_bat, bare, below) it
+took 20, 30 and 35 s, after 1,025 to 1,802 updates. Priorities and an epsilon for each bat were not taken apart further.
+Tianshou and RLlib make less than half as many updates a second with the same network and environment; what they spend
+the rest on was not profiled. RLlib's policies come and go: one completes 14, and one a minute later completes few.
 
 So the goal is missed for want of updates. Of apex_bat's 20 s some 6 are over before the first update, with imports and
 2,000 steps of flight; a third of the best peer's time would leave it some 400 updates. Tried for an earlier start: what
@@ -75,6 +75,7 @@ gained, too: Stable-Baselines3 is good after some 1,200 updates, RLlib after few
 peer's time is 6 s, which is when apex_bat makes its first update: the goal would take a peer that needs five minutes.
 """
 
-TRIALS = """Short trainings with other settings of the peers, after the contest, on the same machine, one seed each. So
-few say little: as chosen, Stable-Baselines3 took 30 to 60 s in the two contests of three seeds.
+TRIALS = """Short trainings with other settings of the peers, one seed each, and of apex_bat without mirror images
+and without the average, three seeds; after the contest, on the same machine. One seed says little: as chosen,
+Stable-Baselines3 took 30 to 60 s in the two contests of three seeds.
 """

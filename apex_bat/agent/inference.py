@@ -19,6 +19,7 @@ from apex_bat.experience import ACTION_MEMORY, NUM_ACTIONS, NUM_BINS, NUM_EARS, 
 Array = NDArray[np.float32]
 FILTER_BINS = 3
 ONLINE, TARGET, AVERAGE = "online/", "target/", "average/"  # before the names of parameters in a learner's arrays
+OPTIMISER = "optimiser/"  # before PARAMETER/KEY there: the parameter by its number, the key as torch calls it
 NETWORK_STREAM = 4  # beside the run's seed, for a random stream that is no role's
 
 

@@ -16,10 +16,9 @@ from torch import Tensor
 from torch.optim.adam import adam
 from torch.optim.rmsprop import rmsprop
 
+from apex_bat.agent.inference import OPTIMISER
 from apex_bat.config import settings
 
-PREFIX = "optimiser/"
-"""Begins the names of the state's arrays: `optimiser/PARAMETER/KEY`, the parameter by its number."""
 _ADAM_BETAS = (0.9, 0.999)  # Kingma & Ba (2015)
 
 
@@ -69,7 +68,7 @@ class Optimiser:
             ValueError: the arrays are of another optimiser or of other parameters.
         """
         state = self._state()
-        given = {name: array for name, array in arrays.items() if name.startswith(PREFIX)}
+        given = {name: array for name, array in arrays.items() if name.startswith(OPTIMISER)}
         if {name: tuple(tensor.shape) for name, tensor in state.items()} != {
             name: np.shape(array) for name, array in given.items()
         }:
@@ -81,7 +80,7 @@ class Optimiser:
         """Returns all tensors that change from step to step, by the names of their arrays."""
         tensors = {"step": self._steps} | self._moments
         return {
-            f"{PREFIX}{number}/{key}": tensors[key][number]
+            f"{OPTIMISER}{number}/{key}": tensors[key][number]
             for number in range(len(self._parameters))
             for key in tensors
         }

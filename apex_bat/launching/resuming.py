@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from apex_bat.agent.inference import AVERAGE, ONLINE, TARGET
+from apex_bat.agent.inference import AVERAGE, ONLINE, OPTIMISER, TARGET
 from apex_bat.config import Config, ConfigError, dumps, load
 from apex_bat.config.loading import differences
 from apex_bat.evaluation.runs import RunError, load_config, note
@@ -216,7 +216,7 @@ def _snapshot(path: Path, config: Config) -> SnapshotFacts:
 
 def _hashes_of(arrays: dict[str, Any]) -> dict[str, str]:
     """Returns the hashes of network, target network, averaged network and optimiser of a learner's arrays."""
-    parts = {"network": ONLINE, "target": TARGET, "average": AVERAGE, "optimiser": "optimiser/"}
+    parts = {"network": ONLINE, "target": TARGET, "average": AVERAGE, "optimiser": OPTIMISER}
     return {
         name: digest(part)
         for name, prefix in parts.items()
